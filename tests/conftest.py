@@ -1,0 +1,36 @@
+"""Every test runs with strict dtype promotion and warnings as errors; `x64` switches to float64; `data` finds real files."""
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("MPLBACKEND", "agg")
+
+import jax
+import pytest
+
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+DATA = Path(os.environ.get("KINJAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+
+
+@pytest.fixture
+def x64():
+    """float64 for one test; float32 is restored after it."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(params=["float32", "float64"])
+def precision(request):
+    """Runs a test once in float32 and once in float64, and gives the dtype's name."""
+    with jax.enable_x64(request.param == "float64"):
+        yield request.param
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """The folder of real motion data beside the repository; a test that asks for it is skipped where there is none."""
+    if not DATA.is_dir():
+        pytest.skip(f"no motion data at {DATA} (set KINJAX_DATA)")
+    return DATA
