@@ -1,0 +1,11 @@
+"""Detection of kinematic constraints (Le Callennec and Boulic 2006): from poses to constraints.
+
+displacements -> sigma_epsilon -> lmeds, noise -> instantaneous -> merging, refit, windows, pivots -> engine -> pipeline.
+`settings` holds every number, `results` what comes back, `prepare` what goes in.
+"""
+
+from .pipeline import calibrate, detect, detect_many
+from .results import Detection
+from .settings import Settings
+
+__all__ = ["Detection", "Settings", "calibrate", "detect", "detect_many"]

@@ -1,0 +1,90 @@
+"""Rotations as quaternions `wxyz`, with the components along the **first** axis.
+
+In and out: arrays (4, ...) and (3, ...). Hot kernels keep components first, so that every operation runs down long
+contiguous rows; `axis=-1` arrays of the public types are moved once, at the entry. `exp` takes rotation vectors (full
+angle) to quaternions, `log` back. Quaternions are unit unless said.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .numerics import safe_divide, safe_norm, safe_sqrt
+
+Quaternion = Float[Array, "4 ..."]
+Vector = Float[Array, "3 ..."]
+
+
+def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+    """Hamilton product: first `b`, then `a`."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return jnp.stack([
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    ])
+
+
+def conjugate(q: Quaternion) -> Quaternion:
+    """Inverse rotation."""
+    return jnp.concatenate([q[:1], -q[1:]])
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    """Cross product."""
+    ax, ay, az = a
+    bx, by, bz = b
+    return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
+def dot(a: Float[Array, "c ..."], b: Float[Array, "c ..."]) -> Float[Array, "..."]:
+    """Inner product over the first axis."""
+    return jnp.sum(a * b, axis=0)
+
+
+def rotate(q: Quaternion, v: Vector) -> Vector:
+    """`R(q) v`."""
+    t = jnp.asarray(2.0, v.dtype) * cross(q[1:], v)
+    return v + q[0] * t + cross(q[1:], t)
+
+
+def normalize(q: Quaternion) -> Quaternion:
+    """Unit quaternion; zero and non-finite ones become the identity (their frames are masked)."""
+    n2 = dot(q, q)
+    good = (n2 > 0) & jnp.isfinite(n2)
+    scale = jnp.where(good, 1 / safe_sqrt(jnp.where(good, n2, jnp.ones_like(n2))), jnp.zeros_like(n2))
+    one = jnp.zeros_like(q).at[0].set(1)
+    return jnp.where(good, jnp.where(good, q, one) * scale, one)
+
+
+def matrix(q: Quaternion) -> Float[Array, "3 3 ..."]:
+    """Rotation matrix, rows first."""
+    w, x, y, z = q
+    return jnp.stack([
+        jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
+        jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
+        jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
+    ])
+
+
+def exp(v: Vector) -> Quaternion:
+    """Quaternion of a rotation vector (radians, full angle)."""
+    angle = safe_norm(v, axis=0)
+    half = angle / 2
+    small = angle < 1e-3
+    safe = jnp.where(small, jnp.ones_like(angle), angle)
+    # sin(x/2)/x by its series where the quotient would lose the gradient
+    factor = jnp.where(small, 0.5 - dot(v, v) / 48, jnp.sin(safe / 2) / safe)
+    return jnp.concatenate([jnp.cos(half)[None], factor * v])
+
+
+def log(q: Quaternion) -> Vector:
+    """Rotation vector of a quaternion, angle in [0, pi]."""
+    q = jnp.where(q[0] < 0, -q, q)
+    s = safe_norm(q[1:], axis=0)
+    angle = 2 * jnp.arctan2(s, q[0])
+    small = s < 1e-4
+    return jnp.where(small, 2 * jnp.ones_like(s), safe_divide(angle, s)) * q[1:]
