@@ -25,7 +25,8 @@ def refit_rotation(R, t, alpha_max):
 
     values, vectors = np.linalg.eigh(M)  # ascending
     is_line = values[0] <= np.sin(alpha_max) ** 2
-    used = values > (np.sin(alpha_max) ** 2 if is_line else FLOOR)
+    used = values > FLOOR
+    used[0] &= not is_line  # a line's pivot is free to slide along its axis
     M_pinv_b = vectors[:, used] @ ((vectors[:, used].T @ b) / values[used])
     x = tbar - Rbar @ M_pinv_b
     residual = float(np.sqrt(max(0.0, c - b @ M_pinv_b)))

@@ -26,6 +26,7 @@ from .merging import Elements, Spans, Tolerance, absorb_short_rests, elements, m
 from .noise import Pattern
 from .pivots import merged_pivots
 from .refit import fit, span_moments
+from .settling import settle
 from .sigma_epsilon import SigmaEpsilon, project, project_by_svd
 from .windows import Reward, best_segmentation, window_rewards
 
@@ -122,6 +123,8 @@ def run(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, give
     smooth = clip if paper else Clip(*mean_pose(q, t, valid, plan.mean), valid)
     nu = (jnp.zeros_like(t[0, :, 0]),) * 2 if paper else noise.data_noise(q, t, valid)
     x = displacements(*smooth, plan.span)
+    if paper and plan.span > 1:  # interval i belongs to frames i and i + 1, however far the displacement reaches
+        x = x._replace(valid=x.valid & valid[:, 1 : 1 - plan.span])
     points = _project(plan, numbers, x, smooth)
     patterns, marks, limits = _thresholds(plan, numbers, points, x.valid, nu, templates, given)
     passed = instantaneous(
@@ -132,6 +135,8 @@ def run(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, give
         items, spans = _rest_windows(plan, numbers, clip, nu[0], patterns[0])
     else:
         items, spans = _merge(plan, numbers, passed, x.valid, points, smooth)
+    if not paper:
+        spans = settle(spans, clip.q, clip.t, valid, smooth.q, smooth.t, nu, plan.mean + (plan.span + 1) // 2)
     found, overflow = _refit(plan, numbers, spans, clip), items.total
     if plan.lines and not paper:
         long = (spans.last - spans.first) >= numbers.least

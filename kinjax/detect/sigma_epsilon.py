@@ -77,6 +77,7 @@ def project_svd(rotation: Float[Array, "3 3"], translation: Float[Array, " 3"]) 
     eps_3, _ = residual(s[0])
     eps_1, point = residual(s[2])
     axis = jnp.where(s[0] > floor, vt[2], 0)
+    s = jnp.where(s > floor, s, 0)
     return SigmaEpsilon(s[0], eps_3, s[2], eps_1, point, axis)
 
 
