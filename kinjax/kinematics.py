@@ -35,7 +35,7 @@ def world_transforms(
         return jax.lax.dynamic_update_index_in_dim(world, here, j, 0), None
 
     start = jnp.zeros((joints, 7, n), rotations.dtype)
-    return jax.lax.scan(step, start, (jnp.arange(joints), parents, rotations, translations))[0]
+    return jax.lax.scan(step, start, (jnp.arange(joints, dtype=jnp.int32), parents, rotations, translations))[0]
 
 
 def local_translations(

@@ -1,7 +1,7 @@
 """One page about one detection: what was found, by which thresholds, and the pictures that show why.
 
-In: a `Detection`, and what is known of the motion. Out: a single HTML file that needs nothing else: style and pictures are
-inside it, it runs no script and asks no network. Every name comes from a file, and is escaped.
+In: a `Detection`, and what is known of the motion. Out: a single HTML file that needs nothing else: style and pictures
+are inside it, it runs no script and asks no network. Every name comes from a file, and is escaped.
 """
 
 from __future__ import annotations
@@ -46,13 +46,17 @@ def write_report(
 ) -> Path:
     """Write the page and return its path.
 
-    `motion` or `poses` add the three-dimensional pictures, `truth` a row in the timeline and a table of agreement. Objects
-    beyond the eight with most constraints keep their rows in the tables, and have no pictures.
+    `motion` or `poses` add the three-dimensional pictures, `truth` a row in the timeline and a table of agreement.
+    Objects beyond the eight with most constraints keep their rows in the tables, and have no pictures.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     place = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
     real = None if truth is None else truth.constraints if isinstance(truth, Annotations) else Constraints(tuple(truth))
     shown = _objects(detection)
@@ -64,8 +68,8 @@ def write_report(
         warnings=[*detection.warnings, *_missing(detection)],
         notes=motion.notes if motion is not None else (),
         constraints=[_row(c) for c in found[:MOST_ROWS]],
-        left_out=max(len(found) - MOST_ROWS, 0),
         total=len(found),
+        with_truth=real is not None,
         patterns=[_pattern(p) for p in detection.patterns],
         agreement=_agreement(found, real, detection.frames) if real is not None else [],
         overview=_overview(detection, motion, poses, real),
@@ -125,22 +129,20 @@ def _words(value: Any) -> str:
 
 
 def _missing(detection: Detection) -> list[str]:
-    """Objects that were not seen all the time."""
-    missing = np.asarray(detection.missing).astype(int)
-    return [
-        f"{name}: {n} of {detection.frames} frames missing or masked"
-        for name, n in zip(detection.objects, missing.tolist(), strict=True)
-        if n
-    ]
+    """Objects that were not seen all the time, where the detection's own warnings do not name them already."""
+    counts = zip(detection.objects, np.asarray(detection.missing).astype(int).tolist(), strict=True)
+    known = tuple(w.split(" of ")[0] for w in detection.warnings)
+    return [f"{o}: {n} of {detection.frames} frames missing" for o, n in counts if n and f"{o}: {n}" not in known]
 
 
 def _row(c: Constraint) -> dict[str, str]:
     """A constraint as text."""
-    axis = "" if c.axis is None else " ".join(f"{x:.2f}" for x in c.axis)
+    axis = "" if c.axis is None else " ".join(f"{round(x, 2) + 0.0:.2f}" for x in c.axis)
+    position = ", ".join(f"{round(x, 3) + 0.0:.3f}" for x in c.position)
     return {
         "object": c.object, "type": c.type, "begin": str(c.begin), "end": str(c.end), "begin_s": f"{c.begin_s:.3f}",
-        "end_s": f"{c.end_s:.3f}", "length": f"{c.frames / c.fps:.2f}" if c.fps else "", "residual": f"{1e3 * c.residual:.2f}",
-        "position": ", ".join(f"{x:.3f}" for x in c.position), "axis": axis,
+        "end_s": f"{c.end_s:.3f}", "length": f"{c.frames / c.fps:.2f}" if c.fps else "",
+        "residual": f"{1e3 * c.residual:.2f}", "position": position, "axis": axis,
     }  # fmt: skip
 
 
@@ -153,10 +155,12 @@ def _pattern(p: NoisePattern) -> dict[str, str]:
         text = f"{low:.3g}" if high - low <= 1e-6 * abs(high) else f"{low:.3g} to {high:.3g}"
         return f"{text} {unit}"
 
+    others = [f" of {t.object}" if t.object != p.object else "" for t in p.templates]
+    templates = ", ".join(f"{t.begin} to {t.end}{of}" for t, of in zip(p.templates, others, strict=True))
     return {
         "object": p.object, "type": p.type, "sigma": span(p.sigma_max, "rad/s" if second else "rad"),
         "eps": span(p.eps_max, "m/s" if second else "m"),
-        "templates": ", ".join(f"{t.begin} to {t.end}" + (f" of {t.object}" if t.object != p.object else "") for t in p.templates) or "none",
+        "templates": templates or "none",
         "kept": f"{p.kept} of {p.intervals}" if p.intervals else "",
         "status": "; ".join(STATUS.get(s, s.replace("_", " ")) for s in p.status.split("+")),
         "remark": "" if p.status in ("ok", "automatic", "given") else "remark",
@@ -179,7 +183,7 @@ def _agreement(found: Constraints, real: Constraints, frames: int) -> list[dict[
 
 
 def _png(figure: Figure) -> str:
-    """A figure as a data URI: 128 colours are enough for it, and a third of the size."""
+    """A figure as a data URI: 256 colours are enough for it, and a third of the size."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image
 
@@ -188,12 +192,13 @@ def _png(figure: Figure) -> str:
     canvas.draw()
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     out = io.BytesIO()
-    image.quantize(128, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(out, "png", optimize=True)
+    image.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(out, "png", optimize=True)
     return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode("ascii")
 
 
-def _picture(figure: Figure, caption: str, alt: str) -> dict[str, str]:
-    return {"src": _png(figure), "caption": caption, "alt": alt}
+def _picture(figure: Figure, kind: str, alt: str) -> dict[str, str]:
+    """What the page needs of a picture; it has a caption for each kind."""
+    return {"src": _png(figure), "kind": kind, "alt": alt}
 
 
 def _overview(
@@ -202,25 +207,17 @@ def _overview(
     """The pictures of the whole clip: timeline and scene."""
     from . import plots
 
-    found = detection.constraints
-    out = [
-        _picture(
-            plots.timeline(detection, real),
-            "A row an object, a bar a constraint. Space (the object rests) is tallest, line (it turns about an axis) lower, "
-            "point (it turns about a pivot) lowest." + (" Hatched bars are the truth." if real is not None else ""),
-            f"Timeline of {len(found)} constraints on {len(detection.objects)} objects over {detection.frames} frames",
-        )
-    ]
-    caption = (
-        "Green: constraints active in that frame, with the name of their object. Faint blue: constraints of other times. "
-        "A box with a cross is a space constraint, a thick segment the axis of a line constraint, a dot a pivot."
-    )
+    found, known = detection.constraints, detection.objects
+    alt = f"Timeline of {len(found)} constraints on {len(known)} objects over {detection.frames} frames"
+    out = [_picture(plots.timeline(detection, real), "timeline", alt)]
     if motion is not None and np.ndim(motion.rotations) == 3:
-        ends = [n for n in detection.objects if n in motion.skeleton.names and len(_own(found, n))][:2]
-        out.append(_picture(plots.skeleton_3d(motion, detection, trail=ends), caption, "The skeleton in up to four frames, with the constraints"))
+        ends = [n for n in known if n in motion.skeleton.names and len(_own(found, n))][:2]
+        alt = "The skeleton in up to four frames, with the constraints"
+        out.append(_picture(plots.skeleton_3d(motion, detection, trail=ends), "scene", alt))
     elif poses is not None and np.ndim(poses.position) == 3:
-        names = [n for n in poses.names if n in detection.objects][:MOST_OBJECTS] or list(poses.names)[:MOST_OBJECTS]
-        out.append(_picture(plots.objects_3d(poses.select(names), detection), caption, "The objects in up to four frames, with the constraints"))
+        names = ([n for n in poses.names if n in known] or list(poses.names))[:MOST_OBJECTS]
+        alt = "The objects in up to four frames, with the constraints"
+        out.append(_picture(plots.objects_3d(poses.select(names), detection), "scene", alt))
     return out
 
 
@@ -230,24 +227,11 @@ def _pictures(detection: Detection, name: str) -> list[dict[str, str]]:
 
     have = {c.type for c in _own(detection.constraints, name)}
     kinds = [t for t in TYPES if t in detection.sigma_max] or ["space"]
-    turning = [t for t in ("line", "point") if t in have and t in detection.sigma_max]
+    turning = [t for t in kinds if t != "space"][:1] if have & {"line", "point"} else []
     out = []
-    for kind in dict.fromkeys([kinds[0], *turning[:1]]):
-        out.append(
-            _picture(
-                plots.sigma_epsilon(detection, name, kind),
-                "Every displacement as a point: how far it turns (σ) and how far it goes (ε). Dashed lines are the thresholds; what "
-                "lies in the shaded corner may be a constraint. Green: templates; crosses: template displacements that the "
-                "estimator rejected as outliers.",
-                f"Sigma-epsilon space of {name}, {kind} constraint",
-            )
-        )
-        out.append(
-            _picture(
-                plots.noise_pattern(detection, name, kind),
-                "The same over time, below the thresholds in force at each moment. Blue dots passed; the bar at the foot shows "
-                "the constraints that they were merged into. Templates are shaded.",
-                f"Sigma and epsilon of {name} over time, with the noise pattern of the {kind} constraint",
-            )
-        )
+    for kind in dict.fromkeys([kinds[0], *turning]):
+        alt = f"Sigma-epsilon space of {name}, {kind} constraint"
+        out.append(_picture(plots.sigma_epsilon(detection, name, kind), "space", alt))
+        alt = f"Sigma and epsilon of {name} over time, with the noise pattern of the {kind} constraint"
+        out.append(_picture(plots.noise_pattern(detection, name, kind), "time", alt))
     return out

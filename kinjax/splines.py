@@ -20,7 +20,7 @@ def natural_cubic(
     k = knots.shape[0]
     if k < 2:
         return jnp.broadcast_to(values[0], at.shape)
-    i = jnp.arange(k)
+    i = jnp.arange(k, dtype=jnp.int32)
     h = jnp.where(i[:-1] + 1 < count, knots[1:] - knots[:-1], 1)
     slope = safe_divide(values[1:] - values[:-1], h)
     interior = (i > 0) & (i + 1 < count)
@@ -46,7 +46,7 @@ def monotone_cubic(
     k = knots.shape[0]
     if k < 2:
         return jnp.broadcast_to(values[0], at.shape)
-    i = jnp.arange(k)
+    i = jnp.arange(k, dtype=jnp.int32)
     used = i[:-1] + 1 < count
     h = jnp.where(used, knots[1:] - knots[:-1], 1)
     slope = jnp.where(used, (values[1:] - values[:-1]) / h, 0)
@@ -78,5 +78,5 @@ def monotone_cubic(
 
 def _segment(at: Array, knots: Array, count: Array) -> Array:
     """Index of the knot interval in which each time lies."""
-    used = jnp.where(jnp.arange(knots.shape[0]) < count, knots, jnp.inf)
+    used = jnp.where(jnp.arange(knots.shape[0], dtype=jnp.int32) < count, knots, jnp.inf)
     return jnp.clip(jnp.searchsorted(used, at, side="right") - 1, 0, jnp.maximum(count - 2, 0))

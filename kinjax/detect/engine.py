@@ -188,7 +188,7 @@ def _thresholds(
         jitter = width * nu[1], width * nu[0]
         floor = jnp.hypot(numbers.sigma_floor, jitter[0]), jnp.hypot(numbers.eps_floor, jitter[1])
         least, most, margin = floor, (numbers.sigma_cap + jitter[0], numbers.eps_cap + jitter[1]), numbers.margin
-    middle = jnp.arange(valid.shape[-1]).astype(numbers.rate.dtype) + (0.5 if plan.method == "paper" else plan.span / 2)
+    middle = jnp.arange(valid.shape[-1], dtype=jnp.int32).astype(numbers.rate.dtype) + (0.5 if plan.method == "paper" else plan.span / 2)
     values = [(points.sigma_3, points.eps_3)] * plan.space
     if plan.method == "paper" and plan.lines:
         values.append((points.sigma_1, points.eps_1))

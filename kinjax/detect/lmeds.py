@@ -44,7 +44,7 @@ def lmeds(values: Float[Array, " n"], mask: Bool[Array, " n"]) -> Kept:
     v = jnp.sort(jnp.where(mask, values, inf))
     count = jnp.sum(mask, dtype=jnp.int32)
     h = count // 2 + 1
-    first = jnp.arange(size)
+    first = jnp.arange(size, dtype=jnp.int32)
     last = jnp.minimum(first + h - 1, size - 1)
     inside = (first + h - 1 < count) & (count > 0)
     low, high = v, v[last]

@@ -67,7 +67,7 @@ def frame_tolerance(distance: Float[Array, "..."], most: Int[Array, "..."], reac
 def absorb_short_rests(kind: Int[Array, "objects n"], least: int) -> tuple[Int[Array, "objects n"], Bool[Array, "objects n"]]:
     """Space runs shorter than `least` that touch a line displacement are no constraint and no gap; also where they were."""
     n = kind.shape[-1]
-    at = jnp.arange(n)
+    at = jnp.arange(n, dtype=jnp.int32)
     space = kind == SPACE
     before = jnp.concatenate([jnp.zeros_like(space[:, :1]), space[:, :-1]], -1)
     after = jnp.concatenate([space[:, 1:], jnp.zeros_like(space[:, :1])], -1)
@@ -107,7 +107,7 @@ def elements(
     """
     n = kind.shape[-1]
     begins, ends = running_count(bounds[0]), running_count(bounds[1])
-    rank = jnp.arange(1, capacity + 1)
+    rank = jnp.arange(1, capacity + 1, dtype=jnp.int32)
     find = jax.vmap(lambda c: jnp.searchsorted(c, rank, method="scan_unrolled"))
     first, last = find(begins), find(ends)
     total = begins[:, -1]

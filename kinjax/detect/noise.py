@@ -87,7 +87,7 @@ def template_pattern(
     n = sigma.shape[0]
 
     def one(begin: Array, end: Array, used: Array) -> tuple[Array, ...]:
-        at = begin + jnp.arange(capacity)
+        at = begin + jnp.arange(capacity, dtype=jnp.int32)
         inside = used & (at + span <= end) & (at < n)
         safe = jnp.minimum(at, n - 1)
         mask = inside & valid[safe]

@@ -69,7 +69,7 @@ def _inside(space: tuple[Array, ...], frames: int) -> Bool[Array, "objects frame
     """Frames strictly inside a space constraint; its first and last may also be a pivot's."""
     kind, begin, end = space
     objects = kind.shape[1]
-    lane = jnp.broadcast_to(jnp.arange(objects), kind.shape)
+    lane = jnp.broadcast_to(jnp.arange(objects, dtype=jnp.int32), kind.shape)
     used = (kind == SPACE) & (end - begin >= 2)
     change = jnp.zeros((objects, frames + 1), jnp.int32)
     change = change.at[lane, jnp.where(used, begin + 1, frames)].add(1).at[lane, jnp.where(used, end, frames)].add(-1)

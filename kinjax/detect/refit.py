@@ -67,12 +67,12 @@ def span_moments(
     """
     slots, objects = begin.shape
     frames = valid.shape[-1]
-    lane = jnp.broadcast_to(jnp.arange(objects), begin.shape)
+    lane = jnp.broadcast_to(jnp.arange(objects, dtype=jnp.int32), begin.shape)
     starts = jnp.zeros((objects, frames + 1), bool).at[lane, jnp.where(used, begin, frames)].set(True)[:, :frames]
     span = jnp.clip(running_count(starts) - 1, 0, slots - 1)
-    inside = jnp.arange(frames) < jnp.take_along_axis(jnp.where(used, end, 0).T, span, axis=1)
+    inside = jnp.arange(frames, dtype=jnp.int32) < jnp.take_along_axis(jnp.where(used, end, 0).T, span, axis=1)
     inside &= (jnp.cumsum(used, axis=0, dtype=jnp.int32)[-1] > 0)[:, None] & (
-        jnp.arange(frames) >= jnp.take_along_axis(begin.T, span, axis=1)
+        jnp.arange(frames, dtype=jnp.int32) >= jnp.take_along_axis(begin.T, span, axis=1)
     )
     span = jnp.where(inside, span, slots)
     weight = valid.astype(t.dtype)

@@ -26,7 +26,7 @@ def settle(
 ) -> Spans:
     """Each span with up to `most` more frames at either end, as long as each is seen and in the same place."""
     frames = valid.shape[-1]
-    offset = jnp.arange(1, most + 1)
+    offset = jnp.arange(1, most + 1, dtype=jnp.int32)
 
     def at(x: Array, index: Array) -> Array:
         flat = jnp.broadcast_to(index.reshape(index.shape[0], -1), (*x.shape[:-1], index[0].size))

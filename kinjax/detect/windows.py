@@ -56,7 +56,7 @@ def window_rewards(
     ])
     rows = jnp.pad(rows, pad)
     start_ok = valid
-    at = jnp.arange(frames)
+    at = jnp.arange(frames, dtype=jnp.int32)
 
     def one(length: Int[Array, ""], sums: tuple[Moments, Array]) -> tuple[tuple[Moments, Array], Array]:
         moments, stopped = sums
@@ -85,7 +85,7 @@ def window_rewards(
         sums, earned = one(length, sums)
         return sums, jnp.where(at >= length - 1, jnp.roll(earned, length - 1, axis=-1), -jnp.inf)
 
-    return jax.lax.scan(keep, sums, jnp.arange(shortest, longest + 1))[1]
+    return jax.lax.scan(keep, sums, jnp.arange(shortest, longest + 1, dtype=jnp.int32))[1]
 
 
 def best_segmentation(rewards: Float[Array, "lengths objects frames"], shortest: int) -> Windows:
@@ -104,7 +104,7 @@ def best_segmentation(rewards: Float[Array, "lengths objects frames"], shortest:
         return jnp.concatenate([jnp.maximum(value, best[0])[None], best[:-1]]), length
 
     start = jnp.full((longest, objects), -jnp.inf, rewards.dtype).at[0].set(0)
-    chosen = jax.lax.scan(forward, start, jnp.arange(frames))[1]
+    chosen = jax.lax.scan(forward, start, jnp.arange(frames, dtype=jnp.int32))[1]
 
     def backward(left: Int[Array, " objects"], length: Int[Array, " objects"]) -> tuple[Array, tuple[Array, ...]]:
         is_last = (left == 0) & (length > 0)
