@@ -82,6 +82,20 @@ class Clip(NamedTuple):
     valid: Bool[Array, "objects frames"]
 
 
+class Joints(NamedTuple):
+    """A skeleton's motion, padded: local `rotations`, `moving` translations of the `translated` joints, which frames are
+    `valid`; `at`: the joints that are objects (-1: padding), with the `centers` of their segments in their own frames."""
+
+    rotations: Float[Array, "frames joints 4"]
+    moving: Float[Array, "frames t 3"]
+    valid: Bool[Array, " frames"]
+    offsets: Float[Array, "joints 3"]
+    parents: Int[Array, " joints"]
+    translated: Int[Array, " t"]
+    at: Int[Array, " objects"]
+    centers: Float[Array, "objects 3"]
+
+
 class Found(NamedTuple):
     """Signals by displacement (objects, n), patterns, and constraints by slot (slots, objects); frames both included.
 
@@ -264,24 +278,23 @@ def _refit(plan: Plan, numbers: Numbers, spans: Spans, clip: Clip) -> tuple[Arra
 
 
 @partial(jax.jit, static_argnames="plan")
-def run_motion(
-    plan: Plan, numbers: Numbers, rotations: Float[Array, "frames joints 4"], moving: Float[Array, "frames t 3"],
-    valid: Bool[Array, " frames"], offsets: Float[Array, "joints 3"], parents: Int[Array, " joints"],
-    translated: Int[Array, " t"], at: Int[Array, " objects"], centers: Float[Array, "objects 3"],
-    templates: TemplateSpans, given: tuple[Pattern, ...],
-) -> Found:
-    """Detection from joint rotations: forward kinematics, then `run`. `at`: the joints that are objects (-1: padding)."""
-    world = world_transforms(
-        jnp.moveaxis(rotations, 0, -1), local_translations(offsets, moving, translated), parents
-    )[jnp.maximum(at, 0)]
-    q, t = jnp.moveaxis(world[:, :4], 1, 0), jnp.moveaxis(world[:, 4:], 1, 0)
-    t = t + rotate(q, jnp.broadcast_to(centers.T[:, :, None], t.shape))
-    return run(plan, numbers, Clip(q, t, valid & (at >= 0)[:, None]), templates, given)
-
-
-@partial(jax.jit, static_argnames="plan")
 def run_poses(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, given: tuple[Pattern, ...]) -> Found:
     """Detection from world poses."""
     return run(plan, numbers, clip, templates, given)
 
 
+@partial(jax.jit, static_argnames="plan")
+def run_joints(plan: Plan, numbers: Numbers, joints: Joints, templates: TemplateSpans, given: tuple[Pattern, ...]) -> Found:
+    """Detection from joint rotations: forward kinematics first, in the same compiled function."""
+    return run(plan, numbers, joint_poses(joints), templates, given)
+
+
+def joint_poses(x: Joints) -> Clip:
+    """World poses of the joints that are objects, origins at their segments' centres."""
+    at = jnp.maximum(x.at, 0)
+    world = world_transforms(
+        jnp.moveaxis(x.rotations, 0, -1), local_translations(x.offsets, x.moving, x.translated), x.parents
+    )[at]
+    q, t = jnp.moveaxis(world[:, :4], 1, 0), jnp.moveaxis(world[:, 4:], 1, 0)
+    t = t + rotate(q, jnp.broadcast_to(x.centers.T[:, :, None], t.shape))
+    return Clip(q, t, x.valid & (x.at >= 0)[:, None])

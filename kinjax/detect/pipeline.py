@@ -16,10 +16,11 @@ import numpy as np
 from ..annotations import NoisePattern, Template
 from ..errors import OptionError
 from ..motion import Motion, Poses
+from ..numerics import bucket
 from . import lmeds, noise
-from .engine import Found, Plan, run_poses
+from .engine import Clip, Found, Joints, Plan, joint_poses, run_joints, run_poses
 from .prepare import (
-    PLAN_CAPACITY, Prepared, engine_clip, given_patterns, numbers, plan_of, prepared, template_spans,
+    PLAN_CAPACITY, Prepared, given_patterns, numbers, padded_clip, plan_of, prepared, template_spans,
 )
 from .results import Detection, Segments
 from .settings import Settings
@@ -74,7 +75,7 @@ def detect_many(
     clips = [prepared(s, objects, None, settings) for s in sources]
     groups: dict[tuple[int, float], list[int]] = {}
     for i, c in enumerate(clips):
-        groups.setdefault((c.q.shape[-1], c.rate), []).append(i)
+        groups.setdefault((bucket(c.frames), c.rate), []).append(i)
     out: list[Detection | None] = [None] * len(clips)
     for members in groups.values():
         batch, cuts = _side_by_side([clips[i] for i in members])
@@ -125,9 +126,10 @@ def _run(
             "nothing to detect in so short a clip"
         )
     plan = replace(plan, templates=slots, template_frames=length)
-    arguments = numbers(settings, clip.rate), engine_clip(clip), spans, given
+    arguments = numbers(settings, clip.rate), clip.arrays, spans, given
+    run = run_joints if isinstance(clip.arrays, Joints) else run_poses
     while True:
-        found = run_poses(plan, *arguments)
+        found = run(plan, *arguments)
         needed = int(found.overflow)
         if needed <= plan.capacity:
             return plan, found
@@ -172,7 +174,7 @@ def _detection(
     template = np.zeros((n, objects), int)
     for m in host.marks:
         template = np.maximum(template, cut(m))
-    missing = (~clip.valid[:objects, : clip.frames]).sum(1) + host.missing[:objects]
+    missing = (~clip.valid).sum(1) + host.missing[:objects]
     return Detection(
         middle, cut(host.sigma_3), cut(host.eps_3), cut(host.sigma_1), cut(host.eps_1), cut(host.valid), cut(host.passed), template,
         {k: cut(v[0]) for k, v in zip(kinds, host.limits, strict=True)}, {k: cut(v[1]) for k, v in zip(kinds, host.limits, strict=True)},
@@ -226,25 +228,20 @@ def _warnings(clip: Prepared, patterns: Sequence[NoisePattern], missing: np.ndar
     return out
 
 
+_joint_poses = jax.jit(joint_poses)
+
+
 def _side_by_side(clips: Sequence[Prepared]) -> tuple[Prepared, list[tuple[int, int]]]:
     """Clips of one bucket as one clip with the objects of all; which lanes belong to which."""
     names = tuple(f"{i}\0{n}" for i, c in enumerate(clips) for n in c.names)
     counts = [len(c.names) for c in clips]
-    lanes = 1 << (sum(counts) - 1).bit_length()
     ends = np.cumsum(counts)
-
-    def joined(get: Any, fill: float | bool) -> np.ndarray:
-        parts = [get(c)[..., : len(c.names), :] for c in clips]
-        whole = np.concatenate(parts, axis=-2)
-        pad = np.full((*whole.shape[:-2], lanes - whole.shape[-2], whole.shape[-1]), fill, whole.dtype)
-        return np.concatenate([whole, pad], axis=-2)
-
-    q = joined(lambda c: c.q, 0)
-    q[0, ends[-1] :] = 1
-    first = clips[0]
+    poses = [c.arrays if isinstance(c.arrays, Clip) else jax.device_get(_joint_poses(c.arrays)) for c in clips]
+    parts = [[x[..., :n, :] for x in p] for p, n in zip(poses, counts, strict=True)]
+    arrays = padded_clip(*(np.concatenate(x, axis=-2) for x in zip(*parts, strict=True)))
     batch = replace(
-        first, q=q, t=joined(lambda c: c.t, 0), valid=joined(lambda c: c.valid, False),
-        origin=np.concatenate([c.origin for c in clips]), names=names, frames=max(c.frames for c in clips), clip="batch",
+        clips[0], arrays=arrays, valid=arrays.valid[: ends[-1]], origin=np.concatenate([c.origin for c in clips]),
+        lanes=arrays.valid.shape[0], names=names, frames=max(c.frames for c in clips), clip="batch",
     )
     return batch, [(int(e - n), int(e)) for e, n in zip(ends, counts, strict=True)]
 

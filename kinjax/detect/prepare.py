@@ -19,7 +19,7 @@ from ..errors import OptionError, ShapeError, TemplateError, TemplateTooShort, f
 from ..kinematics import object_poses
 from ..motion import Motion, Poses
 from ..numerics import bucket
-from .engine import Clip, Numbers, Plan
+from .engine import Clip, Joints, Numbers, Plan
 from .merging import Tolerance
 from .noise import Pattern, Spans
 from .settings import Settings
@@ -30,12 +30,13 @@ PLAN_CAPACITY = 64
 
 @dataclass(frozen=True)
 class Prepared:
-    """One clip, ready to run: `arrays` of the engine's `Clip` (host), `origin` (objects, 3) to be added to positions."""
+    """One clip, ready to run: what the engine takes (NumPy arrays), `valid` (objects, frames) without padding, and the
+    `origin` (objects, 3) to be added to the positions that come out."""
 
-    q: np.ndarray
-    t: np.ndarray
+    arrays: Clip | Joints
     valid: np.ndarray
     origin: np.ndarray
+    lanes: int
     names: tuple[str, ...]
     frames: int
     rate: float
@@ -52,7 +53,8 @@ def working_dtype() -> np.dtype:
 
 def as_poses(source: Motion | Poses, objects: Sequence[str] | None, relative_to: str | None) -> Poses:
     """The poses of the objects asked for, in the frame of another object where `relative_to` names one."""
-    names = None if objects is None else list(dict.fromkeys(objects))
+    known = source.skeleton.names if isinstance(source, Motion) else getattr(source, "names", ())
+    names = None if objects is None else list(dict.fromkeys(known[find_name(n, known, "object")] for n in objects))
     wanted = None if names is None or relative_to is None else [*names, relative_to]
     if isinstance(source, Motion):
         poses = object_poses(source, wanted or names)
@@ -106,32 +108,96 @@ def resampled(poses: Poses, rate: float | None) -> Poses:
 
 
 def prepared(source: Motion | Poses, objects: Sequence[str] | None, relative_to: str | None, settings: Settings) -> Prepared:
-    """Poses as padded arrays, components first: objects to a power of two, frames to `numerics.bucket`."""
+    """Arrays padded to a bucket: objects to a power of two, frames to `numerics.bucket`."""
+    near = settings.formulation == "local"  # the comparison of appendix A is about the world's own origin
+    if isinstance(source, Motion) and source.rotations.ndim == 3 and relative_to is None and settings.rate in (None, source.rate):
+        return _prepared_joints(source, objects, near)
     poses = as_poses(source, objects, relative_to)
     original = float(poses.rate), poses.frames
-    if not (np.isfinite(original[0]) and original[0] > 0):
-        raise OptionError(f"rate is {original[0]}: it must be a positive number of frames a second")
+    check_rate(original[0])
     poses = resampled(poses, settings.rate)
     if poses.objects == 0:
         raise OptionError("no object to look at")
-    dtype = working_dtype()
     valid = np.asarray(poses.valid).T
     t = np.asarray(poses.position, float)
-    seen = valid.T[..., None]
     first = np.argmax(valid, axis=1)
-    origin = np.where(valid.any(1)[:, None], t[first, np.arange(poses.objects)], 0.0)
-    if settings.formulation == "global":  # the comparison of appendix A is about the world's own origin
-        origin = np.zeros_like(origin)
-    lanes, frames = 1 << (poses.objects - 1).bit_length(), bucket(poses.frames)
-    q4 = np.zeros((4, lanes, frames), dtype)
-    q4[0] = 1
-    t3 = np.zeros((3, lanes, frames), dtype)
-    mask = np.zeros((lanes, frames), bool)
-    o, f = poses.objects, poses.frames
-    q4[:, :o, :f] = np.where(seen, np.asarray(poses.rotation), [1, 0, 0, 0]).transpose(2, 1, 0)
-    t3[:, :o, :f] = np.where(seen, t - origin, 0.0).transpose(2, 1, 0)
-    mask[:o, :f] = valid
-    return Prepared(q4, t3, mask, origin, poses.names, f, float(poses.rate), poses.clip, poses.up, *original)
+    origin = np.where(valid.any(1)[:, None] & near, t[first, np.arange(poses.objects)], 0.0)
+    seen = valid.T[..., None]
+    q = np.where(seen, np.asarray(poses.rotation), [1, 0, 0, 0]).transpose(2, 1, 0)
+    clip = padded_clip(q, np.where(seen, t - origin, 0.0).transpose(2, 1, 0), valid)
+    return Prepared(
+        clip, valid, origin, clip.q.shape[1], poses.names, poses.frames, float(poses.rate), poses.clip, poses.up, *original
+    )
+
+
+def check_rate(rate: float) -> None:
+    """`OptionError` unless it is a positive number of frames a second."""
+    if not (np.isfinite(rate) and rate > 0):
+        raise OptionError(f"rate is {rate}: it must be a positive number of frames a second")
+
+
+def padded_clip(q: np.ndarray, t: np.ndarray, valid: np.ndarray) -> Clip:
+    """Components-first poses (4 and 3, objects, frames) in the working precision, padded with unseen identity poses."""
+    objects, frames = valid.shape
+    lanes, length, dtype = 1 << (objects - 1).bit_length(), bucket(frames), working_dtype()
+    out = Clip(np.zeros((4, lanes, length), dtype), np.zeros((3, lanes, length), dtype), np.zeros((lanes, length), bool))
+    out.q[0] = 1
+    for whole, part in zip(out, (q, t, valid), strict=True):
+        whole[..., :objects, :frames] = part
+    return out
+
+
+def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool) -> Prepared:
+    """A motion as the engine takes it: only the objects and their ancestors, so that one hand costs one arm."""
+    check_rate(float(motion.rate))
+    top = motion.skeleton.topology
+    names = top.names if objects is None else objects
+    at = list(dict.fromkeys(find_name(n, top.names, "joint", motion.name) for n in names))
+    if not at:
+        raise OptionError("no object to look at")
+    needed = set()
+    for j in at:
+        while j >= 0 and j not in needed:
+            needed.add(j)
+            j = top.parents[j]
+    joints = sorted(needed)
+    new = {old: i for i, old in enumerate(joints)}
+    moving = [(k, j) for k, j in enumerate(top.translated) if j in new]
+    dtype, frames = working_dtype(), motion.frames
+    length, room = bucket(frames), 8 * -(-len(joints) // 8)
+    q, t = np.asarray(motion.rotations), np.asarray(motion.translations)
+    if len(joints) < q.shape[1]:
+        q = q[:, joints]
+    t = np.asarray(t[:, [k for k, _ in moving]], float)
+    valid = np.isfinite(q).all((1, 2)) & np.isfinite(t).all((1, 2))
+    root = np.array([top.parents[j] < 0 for _, j in moving])
+    origin = t[np.argmax(valid), int(np.argmax(root))] if near and valid.any() and root.any() else np.zeros(3)
+    t = t - root[:, None] * origin
+    if not valid.all():
+        q, t = np.where(valid[:, None, None], q, [1, 0, 0, 0]), np.where(valid[:, None, None], t, 0)
+    rotations = np.zeros((length, room, 4), dtype)
+    rotations[:frames, : len(joints)] = q
+    rotations[frames:, :, 0] = rotations[:, len(joints) :, 0] = 1
+    translations = np.zeros((length, len(moving), 3), dtype)
+    translations[:frames] = t
+    mask = np.zeros(length, bool)
+    mask[:frames] = valid
+    offsets = np.zeros((room, 3), dtype)
+    offsets[: len(joints)] = np.asarray(motion.skeleton.offsets)[joints]
+    parents = np.full(room, -1, np.int32)
+    parents[: len(joints)] = [new.get(top.parents[j], -1) for j in joints]
+    lanes = 1 << (len(at) - 1).bit_length()
+    centers, index = np.zeros((lanes, 3), dtype), np.full(lanes, -1, np.int32)
+    centers[: len(at)] = motion.skeleton.segment_centers()[at]
+    index[: len(at)] = [new[j] for j in at]
+    arrays = Joints(
+        rotations, translations, mask, offsets, parents, np.array([new[j] for _, j in moving], np.int32), index, centers
+    )
+    rate = float(motion.rate)
+    return Prepared(
+        arrays, np.broadcast_to(valid, (len(at), frames)), np.broadcast_to(origin, (len(at), 3)), lanes,
+        tuple(top.names[j] for j in at), frames, rate, motion.name, top.up, rate, frames,
+    )
 
 
 def widths(settings: Settings, rate: float) -> dict[str, int | tuple[int, int]]:
@@ -199,7 +265,7 @@ def template_spans(
     if not slots:
         return (), 0, 0
     slots = 1 << (slots - 1).bit_length()
-    lanes = clip.q.shape[1]
+    lanes = clip.lanes
     out = []
     for kind in kinds:
         begin, end, used = np.zeros((lanes, slots), np.int32), np.zeros((lanes, slots), np.int32), np.zeros((lanes, slots), bool)
@@ -214,7 +280,7 @@ def template_spans(
 def given_patterns(patterns: Sequence[NoisePattern], clip: Prepared, unit: str, kinds: Sequence[str]) -> tuple[Pattern, ...]:
     """Patterns from `calibrate`, or from a file, as the engine's control points; objects without one keep the floor."""
     where = clip.clip or "clip"
-    lanes = clip.q.shape[1]
+    lanes = clip.lanes
     mine: dict[tuple[str, int], NoisePattern] = {}
     for p in patterns:
         if p.unit != unit:
@@ -248,8 +314,3 @@ def plan_of(settings: Settings, rate: float, slots: int, length: int, given: boo
         types, types[0] or settings.method != "paper", lines, settings.free_pivots, given,  # type: ignore[arg-type]
         capacity=capacity, templates=slots, template_frames=length, **widths(settings, rate),  # type: ignore[arg-type]
     )
-
-
-def engine_clip(clip: Prepared) -> Clip:
-    """The arrays that the engine takes."""
-    return Clip(jnp.asarray(clip.q), jnp.asarray(clip.t), jnp.asarray(clip.valid))

@@ -1,0 +1,66 @@
+"""The file formats: motion comes in and goes out as BVH and npz; annotations as JSON, CSV, Parquet, npz and exports.
+
+In: paths. Out: `Motion`, `Poses` and `Annotations`, in metres, seconds and radians: a file's own units, degrees and
+channel orders stop here. A file is read whole or refused (`FileFormatError`: file, line, column, what was found, the
+remedy); nothing is silently dropped, padded or repeated, and what was tolerated is said in `Motion.notes`. Files are
+written to a temporary neighbour and moved into place. Names are imported on first use.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import FileFormatError, OptionError
+
+if TYPE_CHECKING:
+    from ..motion import Motion
+
+_ROOMS = {
+    "bvh": ("parse_bvh", "read_bvh"),
+    "bvh_write": ("write_bvh",),
+    "npz": ("read_motion_npz", "read_poses_npz", "write_motion_npz", "write_poses_npz"),
+    "annotations_io": ("read_annotations", "write_annotations"),
+    "exports": ("export",),
+}
+_HOME = {name: room for room, names in _ROOMS.items() for name in names}
+_READERS = {".bvh": "read_bvh", ".npz": "read_motion_npz"}
+_WRITERS = {".bvh": "write_bvh", ".npz": "write_motion_npz"}
+
+__all__ = ["load", "save", *sorted(_HOME)]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        value = getattr(import_module(f".{_HOME[name]}", __name__), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+def load(path: str | Path, **options: Any) -> Motion:
+    """The motion in a file; the suffix (any case) chooses the reader: .bvh or .npz.
+
+    `options` go to that reader (`read_bvh`: unit, up). Raises `FileFormatError` for another suffix or a broken file.
+    """
+    reader = _READERS.get(Path(path).suffix.lower())
+    if reader is None:
+        found = f"no motion format has the suffix {Path(path).suffix!r}"
+        raise FileFormatError(found, path=path, remedy=f"motion is read from {', '.join(_READERS)}")
+    return __getattr__(reader)(path, **options)
+
+
+def save(path: str | Path, motion: Motion, **options: Any) -> Path:
+    """Write a motion; the suffix (any case) chooses the writer: .bvh (degrees, six digits) or .npz (exact).
+
+    `options` go to that writer (`write_bvh`: unit, digits). Returns the path. Raises `OptionError` for another suffix.
+    """
+    writer = _WRITERS.get(Path(path).suffix.lower())
+    if writer is None:
+        raise OptionError(f"{path}: no motion format has the suffix {Path(path).suffix!r}; write {' or '.join(_WRITERS)}")
+    return __getattr__(writer)(path, motion, **options)

@@ -1,0 +1,218 @@
+"""Detection as a whole: the same answer however it is asked for, few compilations, clear errors, nothing leaks."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from kinjax import synthetic
+from kinjax.annotations import Template
+from kinjax.detect import Settings, calibrate, detect, detect_many
+from kinjax.errors import OptionError, ShapeError, TemplateError, TemplateTooShort, UnknownNameError
+from kinjax.kinematics import object_poses
+from kinjax.motion import make_poses
+
+FEET = ("LeftFoot", "RightFoot")
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return synthetic.walking_biped()
+
+
+@pytest.fixture(scope="module")
+def foot():
+    return synthetic.rolling_foot()
+
+
+def spans(found):
+    return [(c.object, c.type, c.begin, c.end) for c in found.constraints]
+
+
+def test_motion_and_its_poses_give_the_same(walk):
+    a = detect(walk.motion, FEET)
+    b = detect(object_poses(walk.motion, FEET))
+    assert spans(a) == spans(b) and len(a.constraints) > 4
+    for x, y in zip(a.constraints, b.constraints, strict=True):
+        np.testing.assert_allclose(x.position, y.position, atol=2e-5)
+
+
+def test_names_in_any_case_and_order(walk):
+    a = detect(walk.motion, ["rightfoot", "LEFTFOOT", "RightFoot"])
+    assert a.objects == ("RightFoot", "LeftFoot")
+    assert sorted(spans(a)) == sorted(spans(detect(walk.motion, FEET)))
+
+
+@pytest.mark.parametrize("distance", [1e3])
+def test_one_kilometre_from_the_origin(walk, distance):
+    motion = walk.motion
+    shift = np.array([distance, 0.0, -distance])
+    far = dataclasses.replace(motion, translations=motion.translations + shift)
+    a, b = detect(motion, FEET), detect(far, FEET)
+    assert spans(a) == spans(b)
+    for x, y in zip(a.constraints, b.constraints, strict=True):
+        np.testing.assert_allclose(np.array(y.position) - shift, x.position, atol=2e-5)
+
+
+def test_batch_equals_single_clips_and_nothing_leaks(foot):
+    short = dataclasses.replace(foot.poses.slice(0, 329), clip="short")
+    broken = dataclasses.replace(foot.poses, position=np.where(np.arange(foot.frames)[:, None, None] % 3 == 0, np.nan, foot.poses.position))
+    broken = make_poses(broken.names, broken.rotation, broken.position, broken.rate, clip="broken")
+    clips = [foot.poses, broken, short]
+    together = detect_many(clips)
+    for clip, found in zip(clips, together, strict=True):
+        alone = detect(clip)
+        assert spans(alone) == spans(found) and found.clip == clip.clip
+        np.testing.assert_array_equal(np.asarray(alone.sigma_3), np.asarray(found.sigma_3))
+        np.testing.assert_array_equal(alone.missing, found.missing)
+    assert together[1].missing[0] > 100 and together[0].missing[0] == 0
+
+
+def test_padding_changes_nothing(foot):
+    whole = detect(foot.poses, types=("space", "line", "point"))
+    q, t = np.asarray(foot.poses.rotation), np.asarray(foot.poses.position)
+    extra = 40
+    longer = make_poses(
+        foot.poses.names, np.concatenate([q, np.full((extra, *q.shape[1:]), np.nan)]),
+        np.concatenate([t, np.full((extra, *t.shape[1:]), np.nan)]), foot.poses.rate,
+    )
+    assert spans(detect(longer, types=("space", "line", "point"))) == spans(whole)
+
+
+@pytest.fixture
+def compilations():
+    """A list that grows by one with every XLA compilation."""
+    seen = []
+
+    def listen(name, seconds, **_):
+        if name == "/jax/core/compile/backend_compile_duration":
+            seen.append(seconds)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield seen
+    jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def test_a_second_clip_of_the_same_bucket_compiles_nothing(foot, walk, compilations):
+    detect(foot.poses.slice(0, 380))
+    detect(walk.motion.slice(0, 350), FEET)
+    assert compilations  # the listener hears
+    compilations.clear()
+    detect(foot.poses.slice(0, 340))
+    detect(foot.poses.slice(20, 380), still=(0.2, 2.0), min_duration=0.1, max_gap=0.05)
+    detect(walk.motion.slice(20, 360), ["RightFoot", "LeftFoot"])
+    assert not compilations
+
+
+def test_missing_frames_are_masked_counted_and_said(foot):
+    gaps = synthetic.with_gaps(foot, spans=[("foot", 60, 72)])
+    found = detect(gaps.poses)
+    assert found.missing[0] == 13
+    assert any("13 of" in w for w in found.warnings)
+    assert len(found.constraints) == len(detect(foot.poses).constraints)  # 0.13 s out of sight cuts no stance
+
+
+def test_spikes_are_removed_and_do_not_cut(foot):
+    spoiled = synthetic.with_outliers(foot, fraction=0.03, size=0.05, seed=1)
+    assert len(detect(spoiled.poses).constraints) == len(detect(foot.poses).constraints)
+
+
+def test_calibrated_patterns_equal_templates(walk):
+    template = [Template("LeftFoot", *_stance(walk))]
+    pattern = calibrate(walk.motion, template)
+    assert pattern[0].object == "LeftFoot" and pattern[0].kept >= pattern[0].intervals // 2 and pattern[0].unit == "per_second"
+    assert spans(detect(walk.motion, ["LeftFoot"], patterns=pattern)) == spans(detect(walk.motion, ["LeftFoot"], templates=template))
+
+
+def _stance(scene):
+    c = max((c for c in scene.truth if c.object == "LeftFoot" and c.type == "space"), key=lambda c: c.frames)
+    return c.begin, c.end
+
+
+def test_a_second_template_refines(walk):
+    stances = [(c.begin, c.end) for c in walk.truth.of("LeftFoot", "space")][:2]
+    noisy = synthetic.with_noise(walk, 0.001, 3).poses
+    one = calibrate(noisy, [Template("LeftFoot", *stances[0])], method="paper")[0]
+    two = calibrate(noisy, [Template("LeftFoot", *s) for s in stances], method="paper")[0]
+    assert len(two.sigma_max) == 4 and two.frames == (*stances[0], *stances[1])
+    assert two.sigma_max[:2] == one.sigma_max
+
+
+def test_rate_and_stride(foot):
+    half = detect(foot.poses, rate=50.0)
+    full = detect(foot.poses)
+    assert len(half.constraints) == len(full.constraints)
+    for a, b in zip(half.constraints, full.constraints, strict=True):
+        assert abs(a.begin - b.begin) <= 4 and abs(a.end - b.end) <= 4  # frames of the original clip
+
+
+def test_relative_frames():
+    scene = synthetic.rolling_foot()
+    rng = np.random.default_rng(0)
+    from scipy.spatial.transform import Rotation
+
+    drift = np.cumsum(rng.normal(size=(scene.frames, 3)) * 0.03, 0)
+    turn = Rotation.from_rotvec(np.cumsum(rng.normal(size=(scene.frames, 3)) * 0.05, 0))
+    q = Rotation.from_quat(scene.poses.rotation[:, 0][:, [1, 2, 3, 0]])
+    moved = (turn * q).as_quat()[:, [3, 0, 1, 2]]
+    poses = make_poses(
+        ["foot", "treadmill"], np.stack([moved, turn.as_quat()[:, [3, 0, 1, 2]]], 1),
+        np.stack([turn.apply(scene.poses.position[:, 0]) + drift, drift], 1), scene.rate,
+    )
+    assert spans(detect(poses, ["foot"], relative_to="treadmill")) == spans(detect(scene.poses))
+    assert not detect(poses, ["foot"]).constraints
+
+
+def test_results_are_pytrees(foot):
+    found = detect(foot.poses)
+    doubled = jax.tree.map(lambda x: x, found)
+    assert spans(doubled) == spans(found) and all(isinstance(x, (np.ndarray, float, int)) for x in jax.tree.leaves(found))
+
+
+def test_one_frame_and_two_frames(foot):
+    with pytest.raises(OptionError, match="too short|so short"):
+        detect(foot.poses.slice(0, 0))
+    assert not detect(foot.poses.slice(0, 1), method="paper", thresholds=(1e-3, 1e-3), min_duration=0.08).constraints
+
+
+def test_only_missing_frames(foot):
+    q, t = np.asarray(foot.poses.rotation), np.full_like(foot.poses.position, np.nan)
+    found = detect(make_poses(["foot"], q, t, 100.0))
+    assert not found.constraints and found.missing[0] == foot.frames
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        (dict(objects=["LeftFot"]), UnknownNameError, "LeftFoot"),
+        (dict(templates=[Template("LeftFoot", 10, 100000)]), TemplateError, "outside the clip"),
+        (dict(templates=[Template("LeftFoot", 30, 20)]), TemplateError, "ends before it begins"),
+        (dict(templates=[Template("LeftFoot", 10, 11)]), TemplateTooShort, "at least"),
+        (dict(templates=[Template("LeftFoot", 10, 60), Template("LeftFoot", 40, 90)]), TemplateError, "overlap"),
+        (dict(templates=[Template("Nose", 10, 60)]), UnknownNameError, "Nose"),
+        (dict(method="paper"), OptionError, "template"),
+        (dict(methd="paper"), OptionError, "method"),
+        (dict(method="magic"), OptionError, "robust"),
+        (dict(types=("plane",)), OptionError, "space, line, point"),
+        (dict(thresholds=(1.0, 1.0)), OptionError, "paper"),
+        (dict(rate=-1.0), OptionError, "rate"),
+    ],
+)
+def test_errors_say_what_to_do(walk, options, error, words):
+    options = {"objects": FEET, **options}
+    with pytest.raises(error, match=words):
+        detect(walk.motion, **options)
+
+
+def test_shapes_are_checked():
+    with pytest.raises(ShapeError):
+        make_poses(["a"], np.zeros((3, 1, 3)), np.zeros((3, 1, 3)), 30.0)
+    with pytest.raises(ShapeError, match="length 2"):
+        make_poses(["a"], np.ones((3, 1, 4)), np.zeros((3, 1, 3)), 30.0)
+    with pytest.raises(ShapeError, match="Motion or Poses"):
+        detect([1, 2, 3])
+
+
+def test_settings_are_hashable_and_checked():
+    assert hash(Settings()) == hash(Settings()) and Settings().but(types=("LINE",)).types == ("line",)
