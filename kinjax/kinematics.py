@@ -142,8 +142,18 @@ def _typical_shape(points: np.ndarray) -> np.ndarray:
 
 
 def quaternions_of(matrices: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, "... 4"]:
-    """Unit quaternions (wxyz, w >= 0) of rotation matrices, on the host, by SciPy."""
+    """Unit quaternions (wxyz, w >= 0) of rotation matrices, on the host, by SciPy.
+
+    Matrices that are nearly rotations are taken to the nearest one; mirrored ones, and ones whose `R^T R` is off the
+    identity by more than 1e-3, are refused (`ShapeError`).
+    """
     from scipy.spatial.transform import Rotation
 
-    flat = Rotation.from_matrix(np.asarray(matrices, float).reshape(-1, 3, 3)).as_quat(canonical=True)
-    return flat[:, [3, 0, 1, 2]].reshape(*matrices.shape[:-2], 4)
+    flat = np.asarray(matrices, float).reshape(-1, 3, 3)
+    off = np.abs(flat.swapaxes(1, 2) @ flat - np.eye(3)).max((1, 2), initial=0.0)
+    bad = ~((off <= 1e-3) & (np.linalg.det(flat) > 0))
+    if bad.any():
+        i = int(bad.argmax())
+        raise ShapeError(f"matrix {i} is no rotation: R^T R is {off[i]:.3g} off the identity, its determinant is {np.linalg.det(flat[i]):.4g}")
+    q = Rotation.from_matrix(flat).as_quat(canonical=True)
+    return q[:, [3, 0, 1, 2]].reshape(*np.shape(matrices)[:-2], 4)

@@ -17,8 +17,8 @@ def eps_of(x: Float[Array, "..."]) -> float:
 
 
 def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Square root; 0 with gradient 0 where `x <= 0`."""
-    positive = x > 0
+    """Square root; 0 with gradient 0 where `x <= 0`. NaN stays NaN."""
+    positive = ~(x <= 0)
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, jnp.ones_like(x))), jnp.zeros_like(x))
 
 

@@ -86,5 +86,5 @@ def log(q: Quaternion) -> Vector:
     q = jnp.where(q[0] < 0, -q, q)
     s = safe_norm(q[1:], axis=0)
     angle = 2 * jnp.arctan2(s, q[0])
-    small = s < 1e-4
-    return jnp.where(small, 2 * jnp.ones_like(s), safe_divide(angle, s)) * q[1:]
+    small = s < 1e-4  # 2 asin(s)/s by its series where the quotient would lose the gradient
+    return jnp.where(small, 2 + s * s / 3, safe_divide(angle, s)) * q[1:]

@@ -146,11 +146,11 @@ def run(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, give
         limits[0] if plan.space else None, limits[-1] if paper and plan.lines else None, numbers.axis_min,
     )
     if plan.method == "window":
-        items, spans = _rest_windows(plan, numbers, clip, nu[0], patterns[0])
+        items, spans = _rest_windows(plan, numbers, clip, nu, templates)
     else:
         items, spans = _merge(plan, numbers, passed, x.valid, points, smooth)
     if not paper:
-        spans = settle(spans, clip.q, clip.t, valid, smooth.q, smooth.t, nu, plan.mean + (plan.span + 1) // 2)
+        spans = settle(spans, clip, smooth, nu, 0 if plan.method == "window" else plan.span, plan.mean + (plan.span + 1) // 2)
     found, overflow = _refit(plan, numbers, spans, clip), items.total
     if plan.lines and not paper:
         long = (spans.last - spans.first) >= numbers.least
@@ -232,7 +232,11 @@ def _merge(
     n = kind.shape[-1]
     lines = plan.method == "paper" and plan.lines
     low, high = (0, 1) if plan.method == "paper" else (plan.span // 2, (plan.span + 1) // 2)
-    start, stop = poses.t[..., low : low + n], poses.t[..., high : high + n]
+    start, stop = poses.t[..., :n], poses.t[..., plan.span : plan.span + n]
+    if plan.method == "paper":
+        stop = poses.t[..., 1 : n + 1]
+    else:  # a displacement's ends were seen, its middle frames perhaps not
+        start = stop = (start + stop) / 2
     missing = ~valid
     if lines:
         kind, absorbed = absorb_short_rests(kind, numbers.least)
@@ -244,12 +248,21 @@ def _merge(
     return items, Spans(spans.kind, spans.first + low, spans.last + high)
 
 
-def _rest_windows(plan: Plan, numbers: Numbers, clip: Clip, nu: Array, pattern: Pattern) -> tuple[Elements, Spans]:
-    """Space at interval level (method "window"): the best segmentation into windows at rest, neighbours merged by distance."""
-    del pattern
+def _rest_windows(
+    plan: Plan, numbers: Numbers, clip: Clip, nu: tuple[Array, Array], templates: TemplateSpans
+) -> tuple[Elements, Spans]:
+    """Space at interval level (method "window"): the best segmentation into windows at rest, neighbours merged by distance.
+
+    Measured against the noise of the data (position, and rotation at 0.1 m), or the spread of the templates, whichever is
+    larger.
+    """
     dtype = clip.t.dtype
     beta = jnp.asarray(9.0, dtype)
-    reward = Reward(beta, jnp.maximum(numbers.pivot_noise, nu), beta * 0.06 * numbers.rate, numbers.pivot_reach, beta * 0)
+    noise_level = jnp.maximum(numbers.pivot_noise, jnp.hypot(nu[0], jnp.asarray(0.1 * (2 / 3) ** 0.5, dtype) * nu[1]))
+    if plan.templates:
+        spread = jax.vmap(lambda q, t, v, s: noise.template_spread(q, t, v, s, plan.template_frames), in_axes=(1, 1, 0, 0))
+        noise_level = jnp.maximum(noise_level, spread(*clip, templates[0]))
+    reward = Reward(beta, noise_level, beta * jnp.asarray(0.06, dtype) * numbers.rate, numbers.pivot_reach, beta * 0)
     nothing = jnp.zeros_like(clip.valid)
     windows = best_segmentation(
         window_rewards(*clip, nothing, *plan.rest, reward, rest=True), plan.rest[0]

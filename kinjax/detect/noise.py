@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..numerics import order_statistic, safe_sqrt
+from ..numerics import order_statistic, safe_divide, safe_sqrt
 from ..rotations import matrix
 from ..splines import monotone_cubic, natural_cubic
 from .displacements import shifted
@@ -105,6 +105,30 @@ def template_pattern(
     marks = jnp.zeros(n + 1, jnp.int32).at[at.reshape(-1)].max(mark.reshape(-1).astype(jnp.int32))[:n]
     pattern = control_points(spans, sigma_max, eps_max)
     return pattern._replace(intervals=intervals, kept=kept, status=status), marks
+
+
+def template_spread(
+    q: Float[Array, "4 frames"], t: Float[Array, "3 frames"], valid: Bool[Array, " frames"], spans: Spans, capacity: int
+) -> Float[Array, ""]:
+    """Root mean square distance, in metres at a lever of 0.1 m, of a body's poses from their mean over the template frames
+    that the least median of squares keeps; the largest over the templates (window method)."""
+    frames = t.shape[-1]
+
+    def one(begin: Array, end: Array, used: Array) -> Array:
+        at = begin + jnp.arange(capacity, dtype=jnp.int32)
+        safe = jnp.minimum(at, frames - 1)
+        mask = used & (at <= end) & (at < frames) & valid[safe]
+        weight = mask.astype(t.dtype)
+        n = jnp.maximum(jnp.sum(weight), 1)
+        place = t[:, safe] - t[:, begin][:, None]
+        r = matrix(q[:, safe])
+        apart = place - jnp.sum(place * weight, -1, keepdims=True) / n
+        turned = r - jnp.sum(r * weight, -1, keepdims=True) / n
+        square = jnp.sum(apart**2, 0) + jnp.asarray(0.01 / 3, t.dtype) * jnp.sum(turned**2, (0, 1))
+        kept = lmeds(safe_sqrt(square), mask).kept
+        return safe_sqrt(safe_divide(jnp.sum(jnp.where(kept, square, 0)), jnp.sum(kept).astype(t.dtype)))
+
+    return jnp.max(jax.vmap(one)(*spans))
 
 
 def control_points(spans: Spans, sigma_max: Float[Array, " p"], eps_max: Float[Array, " p"]) -> Pattern:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import safe_divide, safe_norm
+from ..numerics import safe_norm
 from ..rotations import cross, dot
 from .displacements import Displacement
 
@@ -55,11 +55,11 @@ def project(x: Displacement) -> SigmaEpsilon:
     """Closed form of the whole projection; angles near pi lose nothing, at rest the axis is 0 and the point 0."""
     sigma_3, eps_3, sigma_1, eps_1 = sigma_epsilon(x)
     turning = sigma_3 > FLOOR_EPS * jnp.finfo(sigma_3.dtype).eps
-    s = sigma_3 / 2
-    axis = jnp.where(turning, safe_divide(x.v, s), 0)
+    s = jnp.where(turning, sigma_3 / 2, 1)  # selected before the divisions: their gradients overflow long before they do
+    axis = jnp.where(turning, x.v, 0) / s
     across = x.d - axis * dot(axis, x.d)
     # (R - I) p + t = 0 across the axis: p = t/2 + cot(theta/2) a x t / 2
-    point = (across + safe_divide(x.w, s) * cross(axis, across)) / 2
+    point = (across + x.w / s * cross(axis, across)) / 2
     return SigmaEpsilon(sigma_3, eps_3, sigma_1, eps_1, jnp.where(turning, point, 0), axis)
 
 

@@ -1,0 +1,36 @@
+"""The compiled programs that the command line keeps between runs, so that only the first run of a kind compiles.
+
+In: the environment. Out: JAX's persistent cache, set before the first computation; only the command line does this.
+`KINJAX_CACHE` names another directory, or `off`; a directory that JAX was already told to use stays.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+OFF = ("off", "0", "no", "none")
+
+
+def use_cache() -> Path | None:
+    """Keep compiled programs in the user's cache directory; gives the directory, or None where there is none."""
+    import jax
+    import platformdirs
+
+    named = os.environ.get("KINJAX_CACHE", "")
+    if named.lower() in OFF:
+        return None
+    told = jax.config.values["jax_compilation_cache_dir"]
+    if told and not named:
+        return Path(told)
+    folder = Path(named) if named else Path(platformdirs.user_cache_dir("kinjax"))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    if not os.access(folder, os.W_OK):
+        return None
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    return folder
