@@ -22,6 +22,7 @@ from .request import SUFFIXES, Clip, check_file, load_clip, request
 from .show import Screen, constraints_table, summary, table
 
 STDOUT = Path("-")
+MOST_WARNINGS = 20  # of a job of several clips that are printed
 Options = Detect | Report | Plot
 
 
@@ -70,6 +71,7 @@ def run(jobs: Sequence[Job], options: Options, screen: Screen) -> int:
         return 0
     rows: list[tuple[str, ...]] = []
     notes: dict[str, None] = {}
+    warnings: list[str] = []
     failed = 0
     with screen.busy(len(jobs)) as busy:
         for done, job in enumerate(jobs):
@@ -82,11 +84,14 @@ def run(jobs: Sequence[Job], options: Options, screen: Screen) -> int:
                 rows.append((job.clip.name, "", "", "", "", "failed"))
                 continue
             notes[note] = None
-            for warning in found.warnings:
-                screen.warn(f"{job.clip.name}: {warning}")
+            warnings += [f"{job.clip.name}: {w}" for w in found.warnings]
             counts = [str(len(found.constraints.of(type=t))) for t in ("space", "line", "point")]
             seconds = f"{(found.frames - 1) / float(found.rate):.2f}"
             rows.append((job.clip.name, seconds, *counts, str(job.output or job.report or "")))
+    for warning in warnings[:MOST_WARNINGS]:
+        screen.warn(warning)
+    if len(warnings) > MOST_WARNINGS:
+        screen.warn(f"{len(warnings) - MOST_WARNINGS} more warnings are in the annotations and reports")
     for note in [n for n in notes if n][:5]:
         screen.print(note)
     screen.print(table(("clip", "seconds", "space", "line", "point", "written"), rows, numbers=(1, 2, 3, 4)))
