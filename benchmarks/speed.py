@@ -35,7 +35,9 @@ def best(run: Callable[[], object], repeats: int) -> float:
     return min(times)
 
 
-def in_turns(a: Callable[[], object], b: Callable[[], object], rounds: int = 5, repeats: int = 3) -> tuple[float, float]:
+def in_turns(
+    a: Callable[[], object], b: Callable[[], object], rounds: int = 5, repeats: int = 3
+) -> tuple[float, float]:
     """Best times of two functions that are timed alternately."""
     pairs = [(best(a, repeats), best(b, 1)) for _ in range(rounds)]
     return min(p[0] for p in pairs), min(p[1] for p in pairs)
@@ -70,8 +72,18 @@ def projection() -> None:
     memory = best(lambda: jax.block_until_ready(touch(v, w, d)), 10)
     ours = min(ours, best(lambda: jax.block_until_ready(project(v, w, d)), 10))
     ns, svd_ns, memory_ns = ours / n * 1e9, svd / few * 1e9, memory / n * 1e9
-    row("projection against np.linalg.svd, per displacement", f"{ns:.2f} ns, {svd_ns:.0f} ns: x{svd_ns / ns:.0f}", ">= 500", svd_ns / ns >= 500)
-    row("projection against one pass over its memory", f"{ns:.2f} ns, {memory_ns:.2f} ns: x{ns / memory_ns:.2f}", "", None)
+    row(
+        "projection against np.linalg.svd, per displacement",
+        f"{ns:.2f} ns, {svd_ns:.0f} ns: x{svd_ns / ns:.0f}",
+        ">= 500",
+        svd_ns / ns >= 500,
+    )
+    row(
+        "projection against one pass over its memory",
+        f"{ns:.2f} ns, {memory_ns:.2f} ns: x{ns / memory_ns:.2f}",
+        "",
+        None,
+    )
 
 
 def walking_crowd(frames: int = 4500, joints: int = 31):
@@ -106,12 +118,19 @@ def whole_detection() -> None:
     rotation, position = (np.asarray(x, float) for x in forward_kinematics(motion))
     from scipy.spatial.transform import Rotation
 
-    matrices = Rotation.from_quat(rotation.reshape(-1, 4)[:, [1, 2, 3, 0]]).as_matrix().reshape(*rotation.shape[:2], 3, 3)
+    matrices = (
+        Rotation.from_quat(rotation.reshape(-1, 4)[:, [1, 2, 3, 0]]).as_matrix().reshape(*rotation.shape[:2], 3, 3)
+    )
 
     def baseline(vectorised: bool, objects: int) -> None:
         for o in range(objects):
             nb.detect(
-                matrices[:, o], position[:, o], rate=120.0, types=("space",), thresholds={"space": thresholds}, vectorised=vectorised
+                matrices[:, o],
+                position[:, o],
+                rate=120.0,
+                types=("space",),
+                thresholds={"space": thresholds},
+                vectorised=vectorised,
             )
 
     def projected() -> None:
@@ -126,10 +145,25 @@ def whole_detection() -> None:
     loops = best(lambda: baseline(False, 3), 1) * motion.joints / 3
     robust = best(lambda: detect(motion), 5)
     size = "4,500 frames x 31 joints"
-    row(f"space detection, {size}, against the vectorised SVD part", f"{mine * 1e3:.1f} ms, {theirs * 1e3:.0f} ms: x{theirs / mine:.0f}", ">= 50", theirs / mine >= 50)
+    row(
+        f"space detection, {size}, against the vectorised SVD part",
+        f"{mine * 1e3:.1f} ms, {theirs * 1e3:.0f} ms: x{theirs / mine:.0f}",
+        ">= 50",
+        theirs / mine >= 50,
+    )
     row("  against the whole vectorised baseline", f"{whole * 1e3:.0f} ms: x{whole / mine:.0f}", "", None)
-    row("  against its loops (3 of 31 objects timed)", f"{loops:.1f} s: x{loops / mine:.0f}", ">= 500", loops / mine >= 500)
-    row("  the robust method on the same clip", f"{robust * 1e3:.1f} ms: x{theirs / robust:.0f} of the SVD part", "", None)
+    row(
+        "  against its loops (3 of 31 objects timed)",
+        f"{loops:.1f} s: x{loops / mine:.0f}",
+        ">= 500",
+        loops / mine >= 500,
+    )
+    row(
+        "  the robust method on the same clip",
+        f"{robust * 1e3:.1f} ms: x{theirs / robust:.0f} of the SVD part",
+        "",
+        None,
+    )
 
 
 def window_stage() -> None:
@@ -148,9 +182,13 @@ def window_stage() -> None:
     clip = Clip(*map(jnp.asarray, arrays))
     shortest, longest = 7, 48
     count = clip.valid.size * (longest - shortest + 1)
-    reward = Reward(jnp.float32(4), jnp.full(4, 3e-3, jnp.float32), jnp.float32(28), jnp.float32(0.2), jnp.float32(1.8e-4))
+    reward = Reward(
+        jnp.float32(4), jnp.full(4, 3e-3, jnp.float32), jnp.float32(28), jnp.float32(0.2), jnp.float32(1.8e-4)
+    )
     score = jax.jit(lambda c: window_rewards(*c, ~c.valid, shortest, longest, reward, rest=False))
-    both = jax.jit(lambda c: best_segmentation(window_rewards(*c, ~c.valid, shortest, longest, reward, rest=False), shortest))
+    both = jax.jit(
+        lambda c: best_segmentation(window_rewards(*c, ~c.valid, shortest, longest, reward, rest=False), shortest)
+    )
     a = best(lambda: jax.block_until_ready(score(clip)), 10) / count * 1e9
     b = best(lambda: jax.block_until_ready(both(clip)), 10) / count * 1e9
     row("window stage, per window (moments and closed-form 3 x 3)", f"{a:.1f} ns", "< 100 ns", a < 100)
@@ -182,7 +220,12 @@ def reading(data: Path | None) -> None:
     ours, other = in_turns(lambda: read_bvh(path), theirs)
     load = best(only_load, 3)
     mb = Path(path).stat().st_size / 1e6
-    row("reading a BVH to rotations, against upc-pymotion", f"{ours * 1e3:.0f} ms ({mb / ours:.0f} MB/s): x{other / ours:.1f}", ">= 10", other / ours >= 10)
+    row(
+        "reading a BVH to rotations, against upc-pymotion",
+        f"{ours * 1e3:.0f} ms ({mb / ours:.0f} MB/s): x{other / ours:.1f}",
+        ">= 10",
+        other / ours >= 10,
+    )
     row("  against its parsing alone (to Euler angles)", f"{load * 1e3:.0f} ms: x{load / ours:.1f}", "", None)
 
 
@@ -196,12 +239,23 @@ def one_object() -> None:
     template = [Template("j5", 130, 180)]
     for method in ("paper", "robust"):
         ms = best(lambda m=method: detect(poses, templates=template, method=m), 30) * 1e3
-        row(f"400 frames, one object, one template, method={method}", f"{ms:.2f} ms: x{25 / ms:.1f} to x{41 / ms:.1f}", ">= 12 of 25 ms", 25 / ms >= 12)
+        row(
+            f"400 frames, one object, one template, method={method}",
+            f"{ms:.2f} ms: x{25 / ms:.1f} to x{41 / ms:.1f}",
+            ">= 12 of 25 ms",
+            25 / ms >= 12,
+        )
 
 
 def main() -> int:
     """Run all, or the named ones."""
-    stages = {"projection": projection, "whole": whole_detection, "windows": window_stage, "reading": None, "one": one_object}
+    stages = {
+        "projection": projection,
+        "whole": whole_detection,
+        "windows": window_stage,
+        "reading": None,
+        "one": one_object,
+    }
     parser = argparse.ArgumentParser(prog="python -m benchmarks.speed", description=__doc__.split("\n\n")[0])
     parser.add_argument("stages", nargs="*", choices=[*stages, []], help="only these")
     parser.add_argument("--data", type=Path, help="folder of real motion data (for reading BVH)")

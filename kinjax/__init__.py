@@ -9,17 +9,27 @@ from typing import Any
 __version__ = "0.1.0"
 
 _ROOMS = {
-    "errors": ("KinjaxError", "FileFormatError", "UnknownNameError", "TemplateError", "TemplateTooShort", "OptionError", "ShapeError"),
+    "errors": (
+        "KinjaxError",
+        "FileFormatError",
+        "UnknownNameError",
+        "TemplateError",
+        "TemplateTooShort",
+        "OptionError",
+        "ShapeError",
+    ),
     "annotations": ("Annotations", "Constraint", "Constraints", "NoisePattern", "Template"),
     "skeleton": ("Skeleton", "Topology"),
     "motion": ("Motion", "Poses", "make_poses"),
     "kinematics": ("object_poses", "cluster_poses", "forward_kinematics"),
-    "detect": ("Detection", "Settings", "calibrate", "detect"),
+    "detect": ("Detection", "Settings", "calibrate", "detect_many"),
     "formats": ("load", "save", "read_bvh", "write_bvh", "read_annotations", "write_annotations"),
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["__version__", *sorted(_HOME)]
+_SUBMODULES = ("detect", "formats", "kinematics", "plots", "report", "synthetic")
+
+__all__ = ["__version__", *sorted(_HOME), *_SUBMODULES]
 
 
 def __getattr__(name: str) -> Any:
@@ -27,6 +37,8 @@ def __getattr__(name: str) -> Any:
         value = getattr(import_module(f".{_HOME[name]}", __name__), name)
         globals()[name] = value
         return value
+    if name in _SUBMODULES:  # kinjax.detect is the room; its door is kinjax.detect.detect
+        return import_module(f".{name}", __name__)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

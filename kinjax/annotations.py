@@ -101,10 +101,13 @@ class Constraints(Sequence[Constraint]):
     def of(self, object: str | None = None, type: str | None = None) -> Constraints:
         """Those of one object (any case) and/or of one type."""
         kind = check_type(type) if type is not None else None
-        return Constraints(tuple(
-            c for c in self.items
-            if (object is None or c.object.casefold() == object.casefold()) and (kind is None or c.type == kind)
-        ))
+        return Constraints(
+            tuple(
+                c
+                for c in self.items
+                if (object is None or c.object.casefold() == object.casefold()) and (kind is None or c.type == kind)
+            )
+        )
 
     def columns(self) -> dict[str, np.ndarray]:
         """Column arrays: object, type, begin, end, begin_s, end_s, x, y, z, axis_x, axis_y, axis_z, residual, pattern.

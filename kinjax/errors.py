@@ -18,7 +18,9 @@ class KinjaxError(ValueError):
 class FileFormatError(KinjaxError):
     """A file that cannot be read as what it claims to be: says file, line, column, what was found and the remedy."""
 
-    def __init__(self, found: str, *, path: object = None, line: int | None = None, column: int | None = None, remedy: str = ""):
+    def __init__(
+        self, found: str, *, path: object = None, line: int | None = None, column: int | None = None, remedy: str = ""
+    ):
         self.path, self.line, self.column, self.found, self.remedy = path, line, column, found, remedy
         where = "" if path is None else str(path)
         if line is not None:
@@ -36,7 +38,11 @@ class UnknownNameError(KinjaxError):
         near = [folded[m] for m in difflib.get_close_matches(name.casefold(), list(folded), n=5, cutoff=0.4)]
         if not near:
             near = [k for k in known if name.casefold() in k.casefold()][:5]
-        hint = f"nearest: {', '.join(near)}" if near else f"known: {', '.join(list(known)[:12])}" + (", ..." if len(known) > 12 else "")
+        hint = (
+            f"nearest: {', '.join(near)}"
+            if near
+            else f"known: {', '.join(list(known)[:12])}" + (", ..." if len(known) > 12 else "")
+        )
         super().__init__(f"{where + ': ' if where else ''}no {what} named {name!r} ({hint})")
         self.name, self.near = name, near
 

@@ -7,6 +7,7 @@ In: a `Motion` (joint rotations) or markers. Out: world rotations and positions,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -15,57 +16,62 @@ from jaxtyping import Array, Float, Int
 
 from .errors import OptionError, ShapeError, find_name
 from .motion import Motion, Poses
+from .numerics import bucket
 from .rotations import multiply, rotate
 
 
 def world_transforms(
-    rotations: Float[Array, "joints 4 n"], translations: Float[Array, "joints 3 n"], parents: Int[Array, " joints"]
-) -> Float[Array, "joints 7 n"]:
+    rotations: Float[Array, "frames joints 4"],
+    moving: Float[Array, "frames t 3"],
+    offsets: Float[Array, "joints 3"],
+    parents: Int[Array, " joints"],
+    translated: Int[Array, " t"],
+) -> Float[Array, "joints 7 frames"]:
     """World quaternion and position of every joint, components before frames: the kernel under everything here.
 
-    rotations: local. translations: local, metres in the parent's frame. A root's parent is -1.
+    rotations: local. offsets: metres in the parent's frame; the `translated` joints have `moving` ones instead. A root's
+    parent is -1.
     """
-    joints, _, n = rotations.shape
-    identity = jnp.zeros((7, n), rotations.dtype).at[0].set(1)
+    frames, joints, _ = rotations.shape
+    own = jnp.full(joints, -1, jnp.int32).at[translated].set(jnp.arange(translated.shape[0], dtype=jnp.int32))
+    paths = jnp.moveaxis(moving, 0, -1)
+    # one row more than joints, the identity, is the parent of the roots
+    world = jnp.zeros((joints + 1, 7, frames), rotations.dtype).at[joints, 0].set(1)
 
-    def step(world: Float[Array, "joints 7 n"], x: tuple[Array, Array, Array, Array]) -> tuple[Array, None]:
-        j, parent, q, t = x
-        above = jnp.where(parent < 0, identity, jax.lax.dynamic_index_in_dim(world, jnp.maximum(parent, 0), 0, keepdims=False))
+    def step(world: Float[Array, "rows 7 frames"], x: tuple[Array, ...]) -> tuple[Array, None]:
+        j, parent, q, offset, path = x
+        above = jax.lax.dynamic_index_in_dim(world, parent, 0, keepdims=False)
+        moved = jax.lax.dynamic_index_in_dim(paths, jnp.maximum(path, 0), 0, keepdims=False)
+        t = jnp.where(path >= 0, moved, offset[:, None])
         here = jnp.concatenate([multiply(above[:4], q), above[4:] + rotate(above[:4], t)])
         return jax.lax.dynamic_update_index_in_dim(world, here, j, 0), None
 
-    start = jnp.zeros((joints, 7, n), rotations.dtype)
-    return jax.lax.scan(step, start, (jnp.arange(joints, dtype=jnp.int32), parents, rotations, translations))[0]
-
-
-def local_translations(
-    offsets: Float[Array, "joints 3"], moving: Float[Array, "frames t 3"], translated: Int[Array, " t"]
-) -> Float[Array, "joints 3 frames"]:
-    """Local translation of every joint: its offset, or the moving translation where it has one."""
-    full = jnp.broadcast_to(offsets[:, :, None], (*offsets.shape, moving.shape[0]))
-    return full.at[translated].set(jnp.moveaxis(moving, 0, -1))
+    order = jnp.arange(joints, dtype=jnp.int32)
+    xs = order, jnp.where(parents < 0, joints, parents), jnp.moveaxis(rotations, 0, -1), offsets, own
+    return jax.lax.scan(step, world, xs)[0][:joints]
 
 
 @jax.jit
 def _forward(rotations: Array, moving: Array, offsets: Array, parents: Array, translated: Array) -> tuple[Array, Array]:
-    world = world_transforms(
-        jnp.moveaxis(rotations, 0, -1), local_translations(offsets, moving, translated), parents
-    )
-    world = jnp.moveaxis(world, -1, 0)
+    world = jnp.moveaxis(world_transforms(rotations, moving, offsets, parents, translated), -1, 0)
     return world[..., :4], world[..., 4:]
 
 
 def forward_kinematics(motion: Motion) -> tuple[Float[Array, "frames joints 4"], Float[Array, "frames joints 3"]]:
     """World rotation (wxyz) and position (metres) of every joint at every frame.
 
-    Shapes (frames, joints, 4) and (frames, joints, 3) of a motion without batch axes.
+    Shapes (frames, joints, 4) and (frames, joints, 3) of a motion without batch axes. Compiles once for each length: pad
+    with `numerics.bucket` where lengths vary.
     """
     if motion.rotations.ndim != 3:
         raise ShapeError(f"rotations {motion.rotations.shape}: one clip is (frames, joints, 4); vmap for more")
     top = motion.skeleton.topology
     return _forward(
-        jnp.asarray(motion.rotations), jnp.asarray(motion.translations), jnp.asarray(motion.skeleton.offsets),
-        jnp.asarray(top.parents, jnp.int32), jnp.asarray(top.translated, jnp.int32),
+        jnp.asarray(motion.rotations),
+        jnp.asarray(motion.translations),
+        jnp.asarray(motion.skeleton.offsets),
+        jnp.asarray(top.parents, jnp.int32),
+        jnp.asarray(top.translated, jnp.int32),
     )
 
 
@@ -78,8 +84,12 @@ def object_poses(motion: Motion, names: Sequence[str] | None = None, origin: str
     top = motion.skeleton.topology
     if origin not in ("segment", "joint"):
         raise OptionError(f"origin={origin!r}: choose segment or joint")
-    at = [find_name(n, top.names, "joint", motion.name) for n in names] if names is not None else list(range(len(top.names)))
-    rotation, position = (np.asarray(x) for x in forward_kinematics(motion))
+    at = (
+        [find_name(n, top.names, "joint", motion.name) for n in names]
+        if names is not None
+        else list(range(len(top.names)))
+    )
+    rotation, position = _forward_padded(motion)
     rotation, position = rotation[:, at], position[:, at]
     if origin == "segment":
         center = motion.skeleton.segment_centers()[at].astype(position.dtype)
@@ -87,6 +97,31 @@ def object_poses(motion: Motion, names: Sequence[str] | None = None, origin: str
         position = position + _rotate_numpy(q, center)
     valid = np.isfinite(rotation).all(-1) & np.isfinite(position).all(-1)
     return Poses(rotation, position, valid, motion.rate, tuple(top.names[i] for i in at), motion.name, top.up)
+
+
+def _forward_padded(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+    """`forward_kinematics` on the host: padded to a bucket, and taken from the roots' first place, so that float32 is as
+    good far from the origin; positions come back in float64."""
+    top, frames = motion.skeleton.topology, motion.frames
+    q, t = np.asarray(motion.rotations), np.array(motion.translations, float)
+    roots = [k for k, j in enumerate(top.translated) if top.parents[j] < 0]
+    finite = np.isfinite(t).all((1, 2))
+    away = t[finite.argmax(), roots[0]].copy() if roots and finite.any() else np.zeros(3)
+    t[:, roots] -= away
+    more = bucket(frames) - frames
+    padded = replace(
+        motion,
+        rotations=np.concatenate([q, np.broadcast_to([1.0, 0, 0, 0], (more, *q.shape[1:]))]),
+        translations=np.concatenate([t, np.zeros((more, *t.shape[1:]))]),
+    )
+    rotation, position = forward_kinematics(padded)
+    # each root carries its own tree; a root without a moving translation was not shifted
+    tree = [j if p < 0 else -1 for j, p in enumerate(top.parents)]
+    for j, p in enumerate(top.parents):
+        tree[j] = j if p < 0 else tree[p]
+    shifted = {top.translated[k] for k in roots}
+    back = np.array([[1.0 if r in shifted else 0.0] for r in tree]) * away
+    return np.asarray(rotation)[:frames], np.asarray(position, float)[:frames] + back
 
 
 def _rotate_numpy(q: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -113,7 +148,9 @@ def cluster_poses(
     for name, points in markers.items():
         points = np.asarray(points, float)
         if points.ndim != 3 or points.shape[-1] != 3 or points.shape[1] < 3:
-            raise ShapeError(f"markers of {name!r} have shape {points.shape}: (frames, at least 3 markers, 3) is needed")
+            raise ShapeError(
+                f"markers of {name!r} have shape {points.shape}: (frames, at least 3 markers, 3) is needed"
+            )
         seen = np.isfinite(points).all((-1, -2))
         if not seen.any():
             raise ShapeError(f"no frame of {name!r} shows all its markers")
@@ -130,9 +167,7 @@ def cluster_poses(
         rotations.append(quaternions_of((u * flip[:, None]) @ vt))
         positions.append(center)
         valids.append(seen)
-    return Poses(
-        np.stack(rotations, 1), np.stack(positions, 1), np.stack(valids, 1), rate, tuple(markers), clip, up
-    )
+    return Poses(np.stack(rotations, 1), np.stack(positions, 1), np.stack(valids, 1), rate, tuple(markers), clip, up)
 
 
 def _typical_shape(points: np.ndarray) -> np.ndarray:
@@ -151,9 +186,11 @@ def quaternions_of(matrices: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, 
 
     flat = np.asarray(matrices, float).reshape(-1, 3, 3)
     off = np.abs(flat.swapaxes(1, 2) @ flat - np.eye(3)).max((1, 2), initial=0.0)
-    bad = ~((off <= 1e-3) & (np.linalg.det(flat) > 0))
-    if bad.any():
-        i = int(bad.argmax())
-        raise ShapeError(f"matrix {i} is no rotation: R^T R is {off[i]:.3g} off the identity, its determinant is {np.linalg.det(flat[i]):.4g}")
+    near = off <= 1e-3
+    good = near & (np.linalg.det(np.where(near[:, None, None], flat, np.eye(3))) > 0)
+    if not good.all():
+        i = int(good.argmin())
+        why = "it mirrors" if near[i] else f"R^T R is {off[i]:.3g} off the identity"
+        raise ShapeError(f"matrix {i} is no rotation: {why}")
     q = Rotation.from_matrix(flat).as_quat(canonical=True)
     return q[:, [3, 0, 1, 2]].reshape(*np.shape(matrices)[:-2], 4)

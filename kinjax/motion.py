@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -66,7 +67,9 @@ class Motion:
         if not 0 <= begin <= end < self.frames:
             raise OptionError(f"frames {begin}..{end} are not inside the clip's 0..{self.frames - 1}")
         return replace(
-            self, translations=self.translations[..., begin : end + 1, :, :], rotations=self.rotations[..., begin : end + 1, :, :]
+            self,
+            translations=self.translations[..., begin : end + 1, :, :],
+            rotations=self.rotations[..., begin : end + 1, :, :],
         )
 
 
@@ -118,11 +121,22 @@ class Poses:
         if not 0 <= begin <= end < self.frames:
             raise OptionError(f"frames {begin}..{end} are not inside the clip's 0..{self.frames - 1}")
         at = slice(begin, end + 1)
-        return replace(self, rotation=self.rotation[..., at, :, :], position=self.position[..., at, :, :], valid=self.valid[..., at, :])
+        return replace(
+            self,
+            rotation=self.rotation[..., at, :, :],
+            position=self.position[..., at, :, :],
+            valid=self.valid[..., at, :],
+        )
 
 
 def make_poses(
-    names: Sequence[str], rotation: Array, position: Array, rate: float, valid: Array | None = None, clip: str = "", up: str = "y"
+    names: Sequence[str],
+    rotation: Array,
+    position: Array,
+    rate: float,
+    valid: Array | None = None,
+    clip: str = "",
+    up: str = "y",
 ) -> Poses:
     """`Poses` from plain arrays, checked: shapes, unit quaternions, finite rate; frames of NaN become invalid.
 
@@ -131,12 +145,16 @@ def make_poses(
     """
     rotation, position = np.asarray(rotation), np.asarray(position)
     if rotation.shape[-1:] != (4,) or position.shape[-1:] != (3,) or rotation.shape[:-1] != position.shape[:-1]:
-        raise ShapeError(f"rotation {rotation.shape} must be (..., frames, objects, 4) and position {position.shape} (..., frames, objects, 3)")
+        raise ShapeError(
+            f"rotation {rotation.shape} must be (..., frames, objects, 4) and position {position.shape} (..., frames, objects, 3)"
+        )
     if position.ndim < 3 or position.shape[-2] != len(names):
-        raise ShapeError(f"{len(names)} names for position of shape {position.shape}; the last axes are frames, objects, 3")
+        raise ShapeError(
+            f"{len(names)} names for position of shape {position.shape}; the last axes are frames, objects, 3"
+        )
     if not (np.isfinite(rate) and rate > 0):
         raise OptionError(f"rate is {rate}: it must be a positive number of frames a second")
-    finite = np.isfinite(rotation).all(-1) & np.isfinite(position).all(-1)
+    finite: Any = np.isfinite(rotation).all(-1) & np.isfinite(position).all(-1)
     if valid is not None:
         valid = np.asarray(valid, bool)
         if valid.shape != finite.shape:
@@ -146,7 +164,9 @@ def make_poses(
     off = np.abs(np.where(finite, norm, 1.0) - 1.0)
     if off.size and off.max() > 1e-3:
         frame, thing = (int(x) for x in np.unravel_index(off.argmax(), off.shape)[-2:])
-        raise ShapeError(f"the quaternion of {names[thing]!r} at frame {frame} has length {1 + off.max():.4g}: normalise rotations first")
+        raise ShapeError(
+            f"the quaternion of {names[thing]!r} at frame {frame} has length {1 + off.max():.4g}: normalise rotations first"
+        )
     return Poses(rotation=rotation, position=position, valid=finite, rate=rate, names=tuple(names), clip=clip, up=up)
 
 

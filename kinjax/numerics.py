@@ -10,6 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+BLOCK = 32
+"""Running sums work in blocks of so many; padded lengths are multiples of it (XLA pads slowly)."""
+
 
 def eps_of(x: Float[Array, "..."]) -> float:
     """Machine epsilon of `x`'s dtype."""
@@ -23,13 +26,23 @@ def safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def safe_norm(x: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
-    """Euclidean norm along `axis`; 0 with gradient 0 at 0. Scaled by the largest component: neither over- nor underflows."""
-    if x.shape[axis] == 0:
+    """Euclidean norm along `axis`; 0 with gradient 0 at 0. Scaled by the largest component: neither over- nor underflows.
+
+    Components are added one by one, not by a reduction: a few long rows then run at the speed of memory.
+    """
+    n = x.shape[axis]
+    if n == 0:
         return jnp.zeros(x.shape[:axis] + x.shape[axis % x.ndim + 1 :], x.dtype)
-    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True))
+    parts = [jax.lax.index_in_dim(x, i, axis, keepdims=False) for i in range(n)]
+    largest = jnp.abs(parts[0])
+    for part in parts[1:]:
+        largest = jnp.maximum(largest, jnp.abs(part))
+    largest = jax.lax.stop_gradient(largest)
     usable = (largest > 0) & jnp.isfinite(largest)
     scale = jnp.where(usable, largest, jnp.ones_like(largest))
-    return jnp.squeeze(scale, axis) * safe_sqrt(jnp.sum((x / scale) ** 2, axis=axis))
+    shrink = 1 / scale
+    squares = sum(((part * shrink) ** 2 for part in parts[1:]), (parts[0] * shrink) ** 2)
+    return jnp.where(jnp.isfinite(largest), scale * safe_sqrt(squares), largest)
 
 
 def safe_divide(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -38,7 +51,9 @@ def safe_divide(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, 
     return jnp.where(usable, a / jnp.where(usable, b, jnp.ones_like(b)), jnp.zeros_like(a / jnp.ones_like(b)))
 
 
-def order_statistic(x: Float[Array, "... n"], mask: Bool[Array, "... n"], rank: Int[Array, "..."]) -> Float[Array, "..."]:
+def order_statistic(
+    x: Float[Array, "... n"], mask: Bool[Array, "... n"], rank: Int[Array, "..."]
+) -> Float[Array, "..."]:
     """The `rank`-th smallest (0-based) of the masked, **non-negative** values along the last axis, exactly.
 
     The bits of non-negative floats order as integers, so the value is found bit by bit, each by one counting pass: no sort
@@ -59,22 +74,28 @@ def order_statistic(x: Float[Array, "... n"], mask: Bool[Array, "... n"], rank: 
     return jnp.where(enough, value, jnp.full_like(value, jnp.nan))
 
 
+def running_sum(x: Float[Array, "... n"]) -> Float[Array, "... n"]:
+    """Inclusive running sum along the last axis, by blocks: a product with a triangle of ones inside them, a short
+    scan over them (XLA's own cumulative sum takes a pass for every power of two)."""
+    n, block = x.shape[-1], BLOCK
+    whole = x if n % block == 0 else jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, -n % block)])
+    blocks = whole.reshape(*x.shape[:-1], -1, block)
+    inside = jnp.matmul(blocks, jnp.triu(jnp.ones((block, block), x.dtype)), precision="highest")
+    total = inside[..., -1]
+    before = jnp.cumsum(total, axis=-1) - total
+    return (inside + before[..., None]).reshape(*x.shape[:-1], -1)[..., :n]
+
+
 def running_count(flags: Bool[Array, "... n"]) -> Int[Array, "... n"]:
-    """Inclusive running count along the last axis, by blocks: one short scan inside blocks, one over blocks."""
-    n = flags.shape[-1]
-    block = 64
-    padded = jnp.pad(flags.astype(jnp.float32), [(0, 0)] * (flags.ndim - 1) + [(0, -n % block)])
-    blocks = padded.reshape(*flags.shape[:-1], -1, block)
-    inside = blocks @ jnp.triu(jnp.ones((block, block), jnp.float32))  # exact: counts up to 64
-    before = jnp.cumsum(inside[..., -1].astype(jnp.int32), axis=-1)
-    before = before - inside[..., -1].astype(jnp.int32)
-    return (inside.astype(jnp.int32) + before[..., None]).reshape(*flags.shape[:-1], -1)[..., :n]
+    """Inclusive running count along the last axis; exact up to 2^24."""
+    return running_sum(flags.astype(jnp.float32)).astype(jnp.int32)
 
 
 def bucket(n: int, smallest: int = 64) -> int:
-    """The next array length from 64, 80, 96, 112, 128, 160, ...: four sizes an octave, so at most a fifth is padding."""
+    """The next array length from 64, 96, 128, 160, 192, 224, 256, 320, ...: from 128 on four sizes an octave, so at most a
+    fifth of a long clip is padding. All are multiples of `BLOCK`."""
     size = smallest
     while size * 2 <= n:
         size *= 2
-    quarter = size // 4
-    return size if n <= size else size + quarter * -(-(n - size) // quarter)
+    step = max(BLOCK, size // 4)
+    return size + step * max(0, -(-(n - size) // step))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .numerics import safe_divide, safe_norm, safe_sqrt
+from .numerics import safe_norm, safe_sqrt
 
 Quaternion = Float[Array, "4 ..."]
 Vector = Float[Array, "3 ..."]
@@ -20,12 +20,14 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     """Hamilton product: first `b`, then `a`."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
-    return jnp.stack([
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    ])
+    return jnp.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ]
+    )
 
 
 def conjugate(q: Quaternion) -> Quaternion:
@@ -41,8 +43,18 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 
 def dot(a: Float[Array, "c ..."], b: Float[Array, "c ..."]) -> Float[Array, "..."]:
-    """Inner product over the first axis."""
-    return jnp.sum(a * b, axis=0)
+    """Inner product over the first axis, component by component (XLA reduces a short leading axis slowly)."""
+    return sum((x * y for x, y in zip(a[1:], b[1:], strict=True)), a[0] * b[0])
+
+
+def apply(r: Float[Array, "3 3 ..."], v: Vector) -> Vector:
+    """`R v`, rows first."""
+    return jnp.stack([dot(row, v) for row in r])
+
+
+def apply_transposed(r: Float[Array, "3 3 ..."], v: Vector) -> Vector:
+    """`R^T v`."""
+    return jnp.stack([dot(r[:, k], v) for k in range(3)])
 
 
 def rotate(q: Quaternion, v: Vector) -> Vector:
@@ -55,19 +67,20 @@ def normalize(q: Quaternion) -> Quaternion:
     """Unit quaternion; zero and non-finite ones become the identity (their frames are masked)."""
     n2 = dot(q, q)
     good = (n2 > 0) & jnp.isfinite(n2)
-    scale = jnp.where(good, 1 / safe_sqrt(jnp.where(good, n2, jnp.ones_like(n2))), jnp.zeros_like(n2))
-    one = jnp.zeros_like(q).at[0].set(1)
-    return jnp.where(good, jnp.where(good, q, one) * scale, one)
+    q = jnp.where(good, q, jnp.zeros_like(q).at[0].set(1))
+    return q * (1 / safe_sqrt(dot(q, q)))
 
 
 def matrix(q: Quaternion) -> Float[Array, "3 3 ..."]:
     """Rotation matrix, rows first."""
     w, x, y, z = q
-    return jnp.stack([
-        jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
-        jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
-        jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
-    ])
+    return jnp.stack(
+        [
+            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
+            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
+            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
+        ]
+    )
 
 
 def exp(v: Vector) -> Quaternion:
@@ -85,6 +98,7 @@ def log(q: Quaternion) -> Vector:
     """Rotation vector of a quaternion, angle in [0, pi]."""
     q = jnp.where(q[0] < 0, -q, q)
     s = safe_norm(q[1:], axis=0)
-    angle = 2 * jnp.arctan2(s, q[0])
-    small = s < 1e-4  # 2 asin(s)/s by its series where the quotient would lose the gradient
-    return jnp.where(small, 2 + s * s / 3, safe_divide(angle, s)) * q[1:]
+    small = s < 1e-4
+    safe = jnp.where(small, jnp.ones_like(s), s)
+    # 2 asin(s)/s by its series where the quotient would lose the gradient
+    return jnp.where(small, 2 + s * s / 3, 2 * jnp.arctan2(safe, q[0]) / safe) * q[1:]

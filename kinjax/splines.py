@@ -21,6 +21,7 @@ def natural_cubic(
     if k < 2:
         return jnp.broadcast_to(values[0], at.shape)
     i = jnp.arange(k, dtype=jnp.int32)
+    values = jnp.where(i < count, values, values[0])  # padding may hold anything
     h = jnp.where(i[:-1] + 1 < count, knots[1:] - knots[:-1], 1)
     slope = safe_divide(values[1:] - values[:-1], h)
     interior = (i > 0) & (i + 1 < count)
@@ -47,6 +48,7 @@ def monotone_cubic(
     if k < 2:
         return jnp.broadcast_to(values[0], at.shape)
     i = jnp.arange(k, dtype=jnp.int32)
+    values = jnp.where(i < count, values, values[0])  # padding may hold anything
     used = i[:-1] + 1 < count
     h = jnp.where(used, knots[1:] - knots[:-1], 1)
     slope = jnp.where(used, (values[1:] - values[:-1]) / h, 0)
@@ -71,7 +73,8 @@ def monotone_cubic(
     u = (jnp.clip(at, knots[0], knots[n]) - knots[j]) / h[j]
     a, b = values[j], values[j + 1]
     return (
-        a * (1 + 2 * u) * (1 - u) ** 2 + b * u**2 * (3 - 2 * u)
+        a * (1 + 2 * u) * (1 - u) ** 2
+        + b * u**2 * (3 - 2 * u)
         + h[j] * (d[j] * u * (1 - u) ** 2 + d[j + 1] * u**2 * (u - 1))
     )
 

@@ -57,7 +57,9 @@ def test_one_kilometre_from_the_origin(walk, distance):
 
 def test_batch_equals_single_clips_and_nothing_leaks(foot):
     short = dataclasses.replace(foot.poses.slice(0, 329), clip="short")
-    broken = dataclasses.replace(foot.poses, position=np.where(np.arange(foot.frames)[:, None, None] % 3 == 0, np.nan, foot.poses.position))
+    broken = dataclasses.replace(
+        foot.poses, position=np.where(np.arange(foot.frames)[:, None, None] % 3 == 0, np.nan, foot.poses.position)
+    )
     broken = make_poses(broken.names, broken.rotation, broken.position, broken.rate, clip="broken")
     clips = [foot.poses, broken, short]
     together = detect_many(clips)
@@ -74,8 +76,10 @@ def test_padding_changes_nothing(foot):
     q, t = np.asarray(foot.poses.rotation), np.asarray(foot.poses.position)
     extra = 40
     longer = make_poses(
-        foot.poses.names, np.concatenate([q, np.full((extra, *q.shape[1:]), np.nan)]),
-        np.concatenate([t, np.full((extra, *t.shape[1:]), np.nan)]), foot.poses.rate,
+        foot.poses.names,
+        np.concatenate([q, np.full((extra, *q.shape[1:]), np.nan)]),
+        np.concatenate([t, np.full((extra, *t.shape[1:]), np.nan)]),
+        foot.poses.rate,
     )
     assert spans(detect(longer, types=("space", "line", "point"))) == spans(whole)
 
@@ -109,7 +113,7 @@ def test_missing_frames_are_masked_counted_and_said(foot):
     gaps = synthetic.with_gaps(foot, spans=[("foot", 60, 72)])
     found = detect(gaps.poses)
     assert found.missing[0] == 13
-    assert any("13 of" in w for w in found.warnings)
+    assert any("13 of" in w and "missing" in w for w in found.warnings)
     assert len(found.constraints) == len(detect(foot.poses).constraints)  # 0.13 s out of sight cuts no stance
 
 
@@ -121,8 +125,14 @@ def test_spikes_are_removed_and_do_not_cut(foot):
 def test_calibrated_patterns_equal_templates(walk):
     template = [Template("LeftFoot", *_stance(walk))]
     pattern = calibrate(walk.motion, template)
-    assert pattern[0].object == "LeftFoot" and pattern[0].kept >= pattern[0].intervals // 2 and pattern[0].unit == "per_second"
-    assert spans(detect(walk.motion, ["LeftFoot"], patterns=pattern)) == spans(detect(walk.motion, ["LeftFoot"], templates=template))
+    assert (
+        pattern[0].object == "LeftFoot"
+        and pattern[0].kept >= pattern[0].intervals // 2
+        and pattern[0].unit == "per_second"
+    )
+    assert spans(detect(walk.motion, ["LeftFoot"], patterns=pattern)) == spans(
+        detect(walk.motion, ["LeftFoot"], templates=template)
+    )
 
 
 def _stance(scene):
@@ -157,8 +167,10 @@ def test_relative_frames():
     q = Rotation.from_quat(scene.poses.rotation[:, 0][:, [1, 2, 3, 0]])
     moved = (turn * q).as_quat()[:, [3, 0, 1, 2]]
     poses = make_poses(
-        ["foot", "treadmill"], np.stack([moved, turn.as_quat()[:, [3, 0, 1, 2]]], 1),
-        np.stack([turn.apply(scene.poses.position[:, 0]) + drift, drift], 1), scene.rate,
+        ["foot", "treadmill"],
+        np.stack([moved, turn.as_quat()[:, [3, 0, 1, 2]]], 1),
+        np.stack([turn.apply(scene.poses.position[:, 0]) + drift, drift], 1),
+        scene.rate,
     )
     assert spans(detect(poses, ["foot"], relative_to="treadmill")) == spans(detect(scene.poses))
     assert not detect(poses, ["foot"]).constraints
@@ -167,11 +179,13 @@ def test_relative_frames():
 def test_results_are_pytrees(foot):
     found = detect(foot.poses)
     doubled = jax.tree.map(lambda x: x, found)
-    assert spans(doubled) == spans(found) and all(isinstance(x, (np.ndarray, float, int)) for x in jax.tree.leaves(found))
+    assert spans(doubled) == spans(found) and all(
+        isinstance(x, (np.ndarray, float, int)) for x in jax.tree.leaves(found)
+    )
 
 
 def test_one_frame_and_two_frames(foot):
-    with pytest.raises(OptionError, match="too short|so short"):
+    with pytest.raises(OptionError, match=r"so short"):
         detect(foot.poses.slice(0, 0))
     assert not detect(foot.poses.slice(0, 1), method="paper", thresholds=(1e-3, 1e-3), min_duration=0.08).constraints
 

@@ -3,9 +3,9 @@
 import jax
 import numpy as np
 import pytest
-from benchmarks import numpy_baseline as nb
 from scipy.spatial.transform import Rotation
 
+from benchmarks import numpy_baseline as nb
 from kinjax.annotations import Template
 from kinjax.detect import detect
 from kinjax.motion import make_poses
@@ -72,7 +72,12 @@ def test_same_labels_with_thresholds(x64, seed, types):
     poses = poses_of(rotation, t, valid)
     found = detect(poses, method="paper", types=types, thresholds=THRESHOLDS)
     expected = nb.detect(
-        rotation.as_matrix(), t, rate=50.0, types=types, valid=valid, vectorised=True,
+        rotation.as_matrix(),
+        t,
+        rate=50.0,
+        types=types,
+        valid=valid,
+        vectorised=True,
         thresholds={k: THRESHOLDS for k in types},
     )
     labels = np.where(expected.valid, expected.label, 0)
@@ -87,12 +92,21 @@ def test_same_labels_with_templates(x64, seed, estimator, interpolation):
     poses = poses_of(rotation, t, valid)
     spans = [(5, 30), (30, 50), (90, 121), (180, 200)][: 1 + seed]
     found = detect(
-        poses, method="paper", estimator=estimator, interpolation=interpolation,
+        poses,
+        method="paper",
+        estimator=estimator,
+        interpolation=interpolation,
         templates=[Template("body", b, e) for b, e in reversed(spans)],
     )
     expected = nb.detect(
-        rotation.as_matrix(), t, rate=50.0, types=("space",), templates=[("space", b, e) for b, e in spans],
-        estimator=estimator, interpolation=interpolation, vectorised=True,
+        rotation.as_matrix(),
+        t,
+        rate=50.0,
+        types=("space",),
+        templates=[("space", b, e) for b, e in spans],
+        estimator=estimator,
+        interpolation=interpolation,
+        vectorised=True,
     )
     np.testing.assert_allclose(found.sigma_max["space"][:, 0], expected.sigma_max["space"], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(found.eps_max["space"][:, 0], expected.eps_max["space"], rtol=1e-9, atol=1e-12)
@@ -110,12 +124,23 @@ def test_same_labels_with_templates(x64, seed, estimator, interpolation):
 def test_projection_routes_and_formulations_agree(x64, formulation, projection, stride):
     rotation, t, valid = clip(7)
     found = detect(
-        poses_of(rotation, t, valid), method="paper", thresholds=THRESHOLDS, types=("space", "line", "point"),
-        formulation=formulation, projection=projection, stride=stride,
+        poses_of(rotation, t, valid),
+        method="paper",
+        thresholds=THRESHOLDS,
+        types=("space", "line", "point"),
+        formulation=formulation,
+        projection=projection,
+        stride=stride,
     )
     expected = nb.detect(
-        rotation.as_matrix(), t, rate=50.0, types=("space", "line", "point"), formulation=formulation, stride=stride,
-        thresholds={k: THRESHOLDS for k in ("space", "line", "point")}, vectorised=True,
+        rotation.as_matrix(),
+        t,
+        rate=50.0,
+        types=("space", "line", "point"),
+        formulation=formulation,
+        stride=stride,
+        thresholds={k: THRESHOLDS for k in ("space", "line", "point")},
+        vectorised=True,
     )
     n = len(found.middle)
     for mine, theirs in (("sigma_3", "sigma3"), ("eps_3", "eps3"), ("eps_1", "eps1")):

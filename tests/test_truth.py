@@ -13,7 +13,10 @@ from kinjax import synthetic
 from kinjax.detect import detect
 
 SCENES = {
-    "dice": synthetic.rolling_dice, "hinge": synthetic.hinge, "ball": synthetic.ball_joint, "foot": synthetic.rolling_foot,
+    "dice": synthetic.rolling_dice,
+    "hinge": synthetic.hinge,
+    "ball": synthetic.ball_joint,
+    "foot": synthetic.rolling_foot,
 }
 ALL = ("space", "line", "point")
 
@@ -27,7 +30,9 @@ def pairs(truth, found):
     """Each true constraint with the found one of its object and type that overlaps it most; and what is left over."""
     left, out = list(found), []
     for c in truth:
-        same = [f for f in left if f.object == c.object and f.type == c.type and min(c.end, f.end) > max(c.begin, f.begin)]
+        same = [
+            f for f in left if f.object == c.object and f.type == c.type and min(c.end, f.end) > max(c.begin, f.begin)
+        ]
         assert same, f"missed: {c}"
         best = max(same, key=lambda f: min(c.end, f.end) - max(c.begin, f.begin))
         left.remove(best)
@@ -62,7 +67,11 @@ def test_robust_with_noise(scene, sigma):
     for seed in range(3):
         poses = synthetic.with_noise(scene, sigma, seed).poses
         for c, f in pairs(scene.truth, robust(scene, poses).constraints):
-            assert abs(f.begin - c.begin) / scene.rate <= 0.040 and abs(f.end - c.end) / scene.rate <= 0.040, (seed, c, f)
+            assert abs(f.begin - c.begin) / scene.rate <= 0.040 and abs(f.end - c.end) / scene.rate <= 0.040, (
+                seed,
+                c,
+                f,
+            )
 
 
 def test_window_laws_at_one_millimetre(scene):
@@ -177,6 +186,8 @@ def test_isolated_bad_frames_in_a_template_hardly_change_the_pattern():
     import dataclasses
 
     spoilt = calibrate(dataclasses.replace(noisy.poses, position=t, rotation=q), template, method="paper")[0]
-    naive = calibrate(dataclasses.replace(noisy.poses, position=t, rotation=q), template, method="paper", estimator="naive")[0]
+    naive = calibrate(
+        dataclasses.replace(noisy.poses, position=t, rotation=q), template, method="paper", estimator="naive"
+    )[0]
     assert abs(spoilt.sigma_max[0] / clean.sigma_max[0] - 1) < 0.05
     assert naive.sigma_max[0] > 5 * clean.sigma_max[0]

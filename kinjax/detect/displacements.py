@@ -10,6 +10,7 @@ are written changes none of the paper's quantities, and the world's is the cheap
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -29,7 +30,10 @@ class Displacement(NamedTuple):
 
 
 def displacements(
-    q: Float[Array, "4 objects frames"], t: Float[Array, "3 objects frames"], valid: Bool[Array, "objects frames"], k: int
+    q: Float[Array, "4 objects frames"],
+    t: Float[Array, "3 objects frames"],
+    valid: Bool[Array, "objects frames"],
+    k: int,
 ) -> Displacement:
     """Displacements from frame `i` to `i + k`, for the `frames - k` intervals that have both."""
     q0, q1 = q[..., :-k], q[..., k:]
@@ -48,7 +52,10 @@ def shifted(x: Array, s: int, fill: float | bool = 0) -> Array:
 
 
 def mean_pose(
-    q: Float[Array, "4 objects frames"], t: Float[Array, "3 objects frames"], valid: Bool[Array, "objects frames"], h: int
+    q: Float[Array, "4 objects frames"],
+    t: Float[Array, "3 objects frames"],
+    valid: Bool[Array, "objects frames"],
+    h: int,
 ) -> tuple[Float[Array, "4 objects frames"], Float[Array, "3 objects frames"]]:
     """Mean pose over the valid ones of `2h + 1` frames around each frame (fewer at the clip's ends).
 
@@ -89,9 +96,10 @@ def spikes(
     def median(window: list[Array]) -> Array:
         window = _sorted_network(window)
         low, high = (count - 1) // 2, count // 2
-        return sum(
-            jnp.where(low == i, x, 0) / 2 + jnp.where(high == i, x, 0) / 2 for i, x in enumerate(window[: half + 1 + (half > 0)])
-        )
+        parts = [
+            jnp.where(low == i, x, 0) / 2 + jnp.where(high == i, x, 0) / 2 for i, x in enumerate(window[: half + 2])
+        ]
+        return functools.reduce(jnp.add, parts)
 
     def outlying(x: Array) -> Array:
         window = [jnp.where(shifted(valid, s, False), shifted(x, s), big) for s in range(-half, half + 1)]

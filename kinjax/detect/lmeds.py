@@ -13,16 +13,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 FEW, EXACT, AMBIGUOUS, SHORT = 1, 2, 4, 8
-"""Bits of `Kept.status`: fewer than ten values; more than half tie; two clusters of one size; fewer than three values."""
+"""Bits of `Kept.status`: fewer than ten values; more than half tie; two clusters of one size (told from ten values on,
+false for 8 % of clean Gaussian sets of 10 and 0.3 % of 20); fewer than three values."""
 
 
 class Kept(NamedTuple):
-    """`largest` value kept, which are `kept`, the robust standard deviation `spread`, `count` of values, `status` bits."""
+    """`largest` value kept, which are `kept`, the robust standard deviation `spread`, `size`: how many values, `status` bits."""
 
     largest: Float[Array, ""]
     kept: Bool[Array, " n"]
     spread: Float[Array, ""]
-    count: Int[Array, ""]
+    size: Int[Array, ""]
     status: Int[Array, ""]
 
 
@@ -71,13 +72,15 @@ def lmeds(values: Float[Array, " n"], mask: Bool[Array, " n"]) -> Kept:
     spread = jnp.maximum(scale * jnp.where(known, smallest, 0), floor)
     center = jnp.where(known, center, 0)
     kept = mask & (jnp.abs(values - center) <= jnp.asarray(2.5, v.dtype) * spread)
-    # two clusters of one size: the window must bridge an empty gap as wide as the median deviation itself
-    gaps = jnp.where((first + 1 < count), v[jnp.minimum(first + 1, size - 1)] - jnp.where(jnp.isfinite(v), v, 0), 0)
-    bridged = jnp.max(jnp.where((gaps > 0) & (jnp.abs(v - center) <= smallest), gaps, 0), initial=0)
+    # two clusters of one size: the window must bridge, half-way through the values, a gap as wide as the median deviation
+    above = v[jnp.minimum(first + 1, size - 1)]
+    halfway = (first + 1 < count) & (jnp.abs(2 * (first + 1) - count) <= 1)
+    across = halfway & (jnp.abs(v - center) <= smallest) & (jnp.abs(above - center) <= smallest)
+    bridged = jnp.max(jnp.where(across, above - v, 0), initial=0)
     status = (
         jnp.where(count < 3, SHORT, 0)
         | jnp.where(count < 10, FEW, 0)
         | jnp.where(known & (smallest <= floor), EXACT, 0)
-        | jnp.where((count >= 6) & (smallest > floor) & (bridged > 0.75 * smallest), AMBIGUOUS, 0)
+        | jnp.where((count >= 10) & (smallest > floor) & (bridged > 0.9 * smallest), AMBIGUOUS, 0)
     ).astype(jnp.int32)
     return Kept(jnp.max(jnp.where(kept, values, 0), initial=0), kept, spread, count, status)

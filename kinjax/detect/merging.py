@@ -7,7 +7,7 @@ time order then steps over the few runs (and single line displacements), all obj
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -55,7 +55,9 @@ class Spans(NamedTuple):
     last: Int[Array, "slots objects"]
 
 
-def frame_tolerance(distance: Float[Array, "..."], most: Int[Array, "..."], reach: Float[Array, ""]) -> Int[Array, "..."]:
+def frame_tolerance(
+    distance: Float[Array, "..."], most: Int[Array, "..."], reach: Float[Array, ""]
+) -> Int[Array, "..."]:
     """`ftol(d) = floor(Fmax^(1 - d/d_max))` (appendix B) in explicit branches: `Fmax` at 0, 1 at `d_max`, 0 beyond, and
     0 for a distance that is not a number."""
     most_f = most.astype(distance.dtype)
@@ -64,7 +66,9 @@ def frame_tolerance(distance: Float[Array, "..."], most: Int[Array, "..."], reac
     return jnp.where(distance <= 0, most, jnp.where(distance <= reach, inner, 0))
 
 
-def absorb_short_rests(kind: Int[Array, "objects n"], least: int) -> tuple[Int[Array, "objects n"], Bool[Array, "objects n"]]:
+def absorb_short_rests(
+    kind: Int[Array, "objects n"], least: Int[Array, ""]
+) -> tuple[Int[Array, "objects n"], Bool[Array, "objects n"]]:
     """Space runs shorter than `least` that touch a line displacement are no constraint and no gap; also where they were."""
     n = kind.shape[-1]
     at = jnp.arange(n, dtype=jnp.int32)
@@ -124,10 +128,14 @@ def elements(
 
     lanes = lambda x: jnp.moveaxis(x, -1, -2)  # noqa: E731  (objects, capacity) -> (capacity, objects)
     return Elements(
-        lanes(jnp.where(real, take(kind, i), NONE)), lanes(i), lanes(j),
-        lanes(take3(start, i)), lanes(take3(stop, j)),
+        lanes(jnp.where(real, take(kind, i), NONE)),
+        lanes(i),
+        lanes(j),
+        lanes(take3(start, i)),
+        lanes(take3(stop, j)),
         lanes(take3(axis, i) if axis is not None else jnp.zeros((3, *i.shape), start.dtype)),
-        lanes(jnp.stack([take(fails, i), take(fails, j)])), lanes(jnp.stack([take(gone, i), take(gone, j)])),
+        lanes(jnp.stack([take(fails, i), take(fails, j)])),
+        lanes(jnp.stack([take(gone, i), take(gone, j)])),
         total,
     )
 
@@ -139,7 +147,7 @@ def merge(items: Elements, tolerance: Tolerance, lines: bool) -> Spans:
     zero3 = jnp.zeros((3, objects), dtype)
     zero = jnp.zeros(objects, jnp.int32)
 
-    def step(open_: tuple[Array, ...], new: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, Array, Array]]:
+    def step(open_: Any, new: Any) -> tuple[Any, Any]:
         kind, first, last, at, axis, fails, gone = open_
         n_kind, n_first, n_last, n_start, n_stop, n_axis, n_fails, n_gone = new
         gap = n_fails[0] - fails
@@ -182,8 +190,14 @@ def merge(items: Elements, tolerance: Tolerance, lines: bool) -> Spans:
         return state, out
 
     xs = (
-        items.kind, items.first, items.last, jnp.moveaxis(items.start, 1, 0), jnp.moveaxis(items.stop, 1, 0),
-        jnp.moveaxis(items.axis, 1, 0), jnp.moveaxis(items.fails, 1, 0), jnp.moveaxis(items.gone, 1, 0),
+        items.kind,
+        items.first,
+        items.last,
+        jnp.moveaxis(items.start, 1, 0),
+        jnp.moveaxis(items.stop, 1, 0),
+        jnp.moveaxis(items.axis, 1, 0),
+        jnp.moveaxis(items.fails, 1, 0),
+        jnp.moveaxis(items.gone, 1, 0),
     )
     start = (jnp.full_like(zero, NONE), zero, zero, zero3, zero3, zero, zero)
     state, out = jax.lax.scan(step, start, xs)

@@ -32,12 +32,12 @@ class Spans(NamedTuple):
 
 
 class Pattern(NamedTuple):
-    """Noise pattern as control points. `frames, sigma, eps` (2P,), `count` of them used; counts and status by template (P,)."""
+    """Noise pattern as control points. `frames, sigma, eps` (2P,), `size` of them used; counts and status by template (P,)."""
 
     frames: Float[Array, " c"]
     sigma: Float[Array, " c"]
     eps: Float[Array, " c"]
-    count: Int[Array, ""]
+    size: Int[Array, ""]
     intervals: Int[Array, " p"]
     kept: Int[Array, " p"]
     status: Int[Array, " p"]
@@ -97,8 +97,13 @@ def template_pattern(
         status = by_sigma.status | jnp.where((raw_sigma > ceiling[0]) | (raw_eps > ceiling[1]), MOVING, 0)
         mark = jnp.where(mask, jnp.where(by_eps.kept, 1, 2), 0)
         return (
-            jnp.clip(raw_sigma, floor[0], ceiling[0]), jnp.clip(raw_eps, floor[1], ceiling[1]),
-            by_sigma.count, jnp.sum(by_eps.kept, dtype=jnp.int32), status, jnp.where(inside, at, n), mark,
+            jnp.clip(raw_sigma, floor[0], ceiling[0]),
+            jnp.clip(raw_eps, floor[1], ceiling[1]),
+            by_sigma.size,
+            jnp.sum(by_eps.kept, dtype=jnp.int32),
+            status,
+            jnp.where(inside, at, n),
+            mark,
         )
 
     sigma_max, eps_max, intervals, kept, status, at, mark = jax.vmap(one)(*spans)
@@ -153,8 +158,13 @@ def control_points(spans: Spans, sigma_max: Float[Array, " p"], eps_max: Float[A
     dtype = sigma_max.dtype
     none = jnp.zeros(p, jnp.int32)
     return Pattern(
-        frames[slot].astype(dtype), doubled(values[0])[slot], doubled(values[1])[slot],
-        jnp.sum(present, dtype=jnp.int32), none, none, none,
+        frames[slot].astype(dtype),
+        doubled(values[0])[slot],
+        doubled(values[1])[slot],
+        jnp.sum(present, dtype=jnp.int32),
+        none,
+        none,
+        none,
     )
 
 
@@ -169,8 +179,8 @@ def thresholds(
         curves = [jnp.broadcast_to(v[0], middle.shape) for v in (pattern.sigma, pattern.eps)]
     else:
         curve = {"cubic": natural_cubic, "monotone": monotone_cubic}[interpolation]
-        curves = [curve(middle, pattern.frames, v, pattern.count) for v in (pattern.sigma, pattern.eps)]
-    some = pattern.count > 0
+        curves = [curve(middle, pattern.frames, v, pattern.size) for v in (pattern.sigma, pattern.eps)]
+    some = pattern.size > 0
     return tuple(jnp.where(some, jnp.maximum(c, f), f) for c, f in zip(curves, floor, strict=True))  # type: ignore[return-value]
 
 

@@ -16,26 +16,14 @@ import numpy as np
 from ..annotations import NoisePattern, Template
 from ..errors import OptionError
 from ..motion import Motion, Poses
-from ..numerics import bucket
-from . import lmeds, noise
-from .engine import Clip, Found, Joints, Plan, joint_poses, run_joints, run_poses
-from .prepare import (
-    PLAN_CAPACITY, Prepared, given_patterns, numbers, padded_clip, plan_of, prepared, template_spans,
-)
-from .results import Detection, Segments
+from ..numerics import BLOCK, bucket
+from .engine import joint_poses, run_joints, run_poses
+from .interface import Clip, Found, Joints, Plan
+from .planning import CAPACITY, given_patterns, numbers, plan_of, template_spans
+from .prepare import Prepared, padded_clip, prepared
+from .records import detection, kinds_of, pattern_records, unit_of
+from .results import Detection
 from .settings import Settings
-
-_STATUS = (
-    (lmeds.FEW, "few_intervals"), (lmeds.EXACT, "exact_fit"), (lmeds.AMBIGUOUS, "ambiguous"),
-    (noise.UNREPRESENTATIVE, "unrepresentative"), (noise.MOVING, "template_moving"),
-)
-_WORDS = {
-    "few_intervals": "its template has fewer than ten displacements: the thresholds are loose",
-    "exact_fit": "more than half of its template's values are equal: there is hardly any noise to learn from",
-    "ambiguous": "its template holds two groups of values of about one size: part of it may be another motion",
-    "unrepresentative": "it would label most of the clip: the template may not show a constraint",
-    "template_moving": "its template moves faster than a body at rest: the thresholds were capped",
-}
 
 
 def detect(
@@ -60,12 +48,16 @@ def detect(
     settings = (settings or Settings()).but(**changes)
     clip = prepared(source, objects, relative_to, settings)
     plan, found = _run(clip, settings, templates, patterns)
-    return _detection(clip, settings, plan, found, templates, patterns)
+    return detection(clip, settings, plan, found, templates, patterns)
 
 
 def detect_many(
-    sources: Sequence[Motion | Poses], objects: Sequence[str] | None = None, *, settings: Settings | None = None,
-    patterns: Sequence[NoisePattern] = (), **changes: Any,
+    sources: Sequence[Motion | Poses],
+    objects: Sequence[str] | None = None,
+    *,
+    settings: Settings | None = None,
+    patterns: Sequence[NoisePattern] = (),
+    **changes: Any,
 ) -> list[Detection]:
     """Detection in many clips: clips of one bucket and rate run as one batch, each object of each clip in a lane of its own.
 
@@ -75,20 +67,29 @@ def detect_many(
     clips = [prepared(s, objects, None, settings) for s in sources]
     groups: dict[tuple[int, float], list[int]] = {}
     for i, c in enumerate(clips):
-        groups.setdefault((bucket(c.frames), c.rate), []).append(i)
+        groups.setdefault((bucket(c.frames + BLOCK), c.rate), []).append(i)
     out: list[Detection | None] = [None] * len(clips)
     for members in groups.values():
         batch, cuts = _side_by_side([clips[i] for i in members])
-        spread = [p.with_object(n) for p in patterns for n in batch.names if n.split("\0")[-1].casefold() == p.object.casefold()]
+        spread = [
+            p.with_object(n)
+            for p in patterns
+            for n in batch.names
+            if n.split("\0")[-1].casefold() == p.object.casefold()
+        ]
         plan, found = _run(batch, settings, (), spread)
         host = jax.device_get(found)
         for i, (begin, end) in zip(members, cuts, strict=True):
-            out[i] = _detection(clips[i], settings, plan, _lanes(host, begin, end), (), patterns)
+            out[i] = detection(clips[i], settings, plan, _lanes(host, begin, end), (), patterns)
     return [d for d in out if d is not None]
 
 
 def calibrate(
-    source: Motion | Poses, templates: Sequence[Template], *, settings: Settings | None = None, relative_to: str | None = None,
+    source: Motion | Poses,
+    templates: Sequence[Template],
+    *,
+    settings: Settings | None = None,
+    relative_to: str | None = None,
     **changes: Any,
 ) -> tuple[NoisePattern, ...]:
     """The noise patterns that `templates` give (step 4), to be used with `detect(..., patterns=...)` on any clip.
@@ -103,7 +104,7 @@ def calibrate(
     names = list(dict.fromkeys(t.object for t in templates))
     clip = prepared(source, names, relative_to, settings)
     plan, found = _run(clip, settings, templates, ())
-    return _patterns(clip, settings, plan, jax.device_get(found), templates)
+    return pattern_records(clip, settings, plan, jax.device_get(found), templates)
 
 
 def _run(
@@ -112,14 +113,14 @@ def _run(
     """Plan and run the engine; with more capacity if needed."""
     if templates and patterns:
         raise OptionError("give templates or patterns, not both; calibrate with all templates to refine a pattern")
-    plan = plan_of(settings, clip.rate, 0, 0, bool(patterns), PLAN_CAPACITY)
-    kinds = _kinds(plan)
+    plan = plan_of(settings, clip.rate, 0, 0, bool(patterns), CAPACITY)
+    kinds = kinds_of(plan)
     if settings.method == "paper" and not (templates or patterns or settings.thresholds):
         raise OptionError(
             'method="paper" needs a template, a pattern or thresholds=(sigma_max, eps_max); method="robust" needs none'
         )
     spans, slots, length = template_spans(templates, clip, settings, plan.span, kinds)
-    given = given_patterns(patterns, clip, _unit(settings), kinds) if patterns else ()
+    given = given_patterns(patterns, clip, unit_of(settings), kinds) if patterns else ()
     if clip.frames <= plan.span:
         raise OptionError(
             f"{clip.clip or 'clip'}: {clip.frames} frame{'s' * (clip.frames != 1)} cannot hold a displacement over {plan.span}: "
@@ -136,98 +137,6 @@ def _run(
         plan = replace(plan, capacity=1 << (needed - 1).bit_length())
 
 
-def _kinds(plan: Plan) -> tuple[str, ...]:
-    """The pattern types of a plan, in the engine's order."""
-    return ("space",) * plan.space + ("line",) * (plan.method == "paper" and plan.lines)
-
-
-def _unit(settings: Settings) -> str:
-    return "per_interval" if settings.method == "paper" else "per_second"
-
-
-def _detection(
-    clip: Prepared, settings: Settings, plan: Plan, found: Found, templates: Sequence[Template], patterns: Sequence[NoisePattern]
-) -> Detection:
-    """Padding removed, frames of the original clip, positions in the world."""
-    host: Found = jax.device_get(found)
-    objects = len(clip.names)
-    n = clip.frames - plan.span
-    cut = lambda x: x[:objects, :n].T  # noqa: E731
-    slot, lane = np.nonzero(host.kind[:, :objects])
-    scale = clip.original_rate / clip.rate
-    frame = lambda x: np.minimum(np.floor(x * scale + 0.5).astype(int), clip.original_frames - 1)  # noqa: E731
-    records = list(patterns) or list(_patterns(clip, settings, plan, host, templates))
-    kind = host.kind[slot, lane]
-    index = {(p.object.casefold(), p.type): i for i, p in reversed(list(enumerate(records)))}
-    types = ("space", "line", "point")
-    which = [
-        index.get((clip.names[o].casefold(), types[k - 1]), index.get((clip.names[o].casefold(), "line"), 0))
-        for o, k in zip(lane, kind, strict=True)
-    ]
-    segments = Segments(
-        lane.astype(int), kind - 1, frame(host.begin[slot, lane]), frame(host.end[slot, lane]),
-        host.position[:, slot, lane].T.astype(float) + clip.origin[lane], host.axis[:, slot, lane].T,
-        host.residual[slot, lane], np.asarray(which, int),
-    )
-    kinds = _kinds(plan)
-    middle = (np.arange(n) + (0.5 if settings.method == "paper" else plan.span / 2)) * scale
-    template = np.zeros((n, objects), int)
-    for m in host.marks:
-        template = np.maximum(template, cut(m))
-    missing = (~clip.valid).sum(1) + host.missing[:objects]
-    return Detection(
-        middle, cut(host.sigma_3), cut(host.eps_3), cut(host.sigma_1), cut(host.eps_1), cut(host.valid), cut(host.passed), template,
-        {k: cut(v[0]) for k, v in zip(kinds, host.limits, strict=True)}, {k: cut(v[1]) for k, v in zip(kinds, host.limits, strict=True)},
-        missing, segments, tuple(records), clip.original_rate, clip.names, clip.original_frames, clip.clip, _unit(settings), settings,
-        tuple(_warnings(clip, records, missing)),
-    )
-
-
-def _patterns(
-    clip: Prepared, settings: Settings, plan: Plan, host: Found, templates: Sequence[Template]
-) -> tuple[NoisePattern, ...]:
-    """The engine's patterns as records: one for each object and type."""
-    out = []
-    scale = clip.original_rate / clip.rate
-    for kind, pattern, limit in zip(_kinds(plan), host.patterns, host.limits, strict=True):
-        for lane, name in enumerate(clip.names):
-            count = int(pattern.count[lane])
-            mine = tuple(
-                t for t in templates
-                if t.object.casefold() == name.casefold() and ("space" if t.type == "space" else "line") == kind
-            )
-            asked = kind if kind == "space" or "line" in settings.types else "point"
-            if count:
-                used = slice(0, count)
-                bits = int(np.bitwise_or.reduce(pattern.status[lane][: len(mine)], initial=0))
-                if float((host.passed[lane, : clip.frames - plan.span] > 0).mean()) > 0.8:
-                    bits |= noise.UNREPRESENTATIVE
-                out.append(NoisePattern(
-                    name, asked, tuple(map(float, pattern.sigma[lane][used])), tuple(map(float, pattern.eps[lane][used])),  # type: ignore[arg-type]
-                    tuple(int(round(f * scale)) for f in pattern.frames[lane][used]), settings.alpha_max, settings.dist_max,
-                    int(pattern.intervals[lane].sum()), int(pattern.kept[lane].sum()),
-                    "+".join(w for b, w in _STATUS if bits & b) or "ok", mine, _unit(settings),  # type: ignore[arg-type]
-                ))
-            else:
-                status = "given" if settings.thresholds else "automatic"
-                out.append(NoisePattern(
-                    name, asked, (float(limit[0][lane, 0]),), (float(limit[1][lane, 0]),), (), settings.alpha_max,  # type: ignore[arg-type]
-                    settings.dist_max, status=status, unit=_unit(settings),  # type: ignore[arg-type]
-                ))
-    return tuple(out)
-
-
-def _warnings(clip: Prepared, patterns: Sequence[NoisePattern], missing: np.ndarray) -> list[str]:
-    """What a person should know, in words."""
-    out = []
-    for p in patterns:
-        out += [f"{p.object} ({p.type}): {_WORDS[s]}" for s in p.status.split("+") if s in _WORDS]
-    for name, lost in zip(clip.names, missing, strict=True):
-        if lost:
-            out.append(f"{name}: {int(lost)} of {clip.frames} frames missing or rejected as spikes")
-    return out
-
-
 _joint_poses = jax.jit(joint_poses)
 
 
@@ -240,8 +149,14 @@ def _side_by_side(clips: Sequence[Prepared]) -> tuple[Prepared, list[tuple[int, 
     parts = [[x[..., :n, :] for x in p] for p, n in zip(poses, counts, strict=True)]
     arrays = padded_clip(*(np.concatenate(x, axis=-2) for x in zip(*parts, strict=True)))
     batch = replace(
-        clips[0], arrays=arrays, valid=arrays.valid[: ends[-1]], origin=np.concatenate([c.origin for c in clips]),
-        lanes=arrays.valid.shape[0], names=names, frames=max(c.frames for c in clips), clip="batch",
+        clips[0],
+        arrays=arrays,
+        valid=np.asarray(arrays.valid)[: ends[-1]],
+        origin=np.concatenate([c.origin for c in clips]),
+        lanes=arrays.valid.shape[0],
+        names=names,
+        frames=max(c.frames for c in clips),
+        clip="batch",
     )
     return batch, [(int(e - n), int(e)) for e, n in zip(ends, counts, strict=True)]
 
@@ -250,9 +165,9 @@ def _lanes(found: Found, begin: int, end: int) -> Found:
     """The part of a batch's result that belongs to some lanes; arrays by object have them first, constraints last."""
     by_lane = lambda x: x[begin:end]  # noqa: E731
     last = {"kind", "begin", "end", "position", "axis", "residual"}
-    return Found(**{
-        f: (v if f == "overflow" else v[..., begin:end] if f in last else jax.tree.map(by_lane, v))
-        for f, v in found._asdict().items()
-    })
-
-
+    return Found(
+        **{
+            f: (v if f == "overflow" else v[..., begin:end] if f in last else jax.tree.map(by_lane, v))
+            for f, v in found._asdict().items()
+        }
+    )

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ..rotations import dot
 from .instantaneous import LINE, NONE, POINT, SPACE
 from .merging import Spans, elements, packed
 from .refit import Moments, fit, pivot_energy, quadratic, span_moments
@@ -33,9 +34,17 @@ Constraintlike = tuple[Array, Array, Array, Array, Array, Array]
 
 
 def merged_pivots(
-    q: Float[Array, "4 objects frames"], t: Float[Array, "3 objects frames"], valid: Bool[Array, "objects frames"],
-    space: tuple[Int[Array, "slots objects"], ...], noise: Float[Array, " objects"], turn_noise: Float[Array, " objects"],
-    lengths: tuple[int, int], free: bool, capacity: int, reach: Float[Array, ""], line_below: Float[Array, ""],
+    q: Float[Array, "4 objects frames"],
+    t: Float[Array, "3 objects frames"],
+    valid: Bool[Array, "objects frames"],
+    space: tuple[Int[Array, "slots objects"], ...],
+    noise: Float[Array, " objects"],
+    turn_noise: Float[Array, " objects"],
+    lengths: tuple[int, int],
+    free: bool,
+    capacity: int,
+    reach: Float[Array, ""],
+    line_below: Float[Array, ""],
     rate: Float[Array, ""],
 ) -> tuple[Constraintlike, Int[Array, " objects"]]:
     """Pivots of every object, and how many windows there were (more than `capacity`: repeat with more).
@@ -85,7 +94,7 @@ def _merged(
 
     def earned(x: Moments) -> Array:
         energy, p = pivot_energy(quadratic(x), reward.ridge)
-        near = jnp.sum(p * p, axis=0) <= reward.reach**2
+        near = dot(p, p) <= reward.reach**2
         return jnp.where(near, x.n * (reward.beta - energy / reward.nu**2) - reward.opening, -jnp.inf)
 
     def step(open_: tuple, new: tuple) -> tuple[tuple, tuple]:

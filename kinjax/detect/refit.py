@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..numerics import running_count, safe_divide, safe_norm, safe_sqrt
-from ..rotations import matrix
+from ..numerics import running_count, running_sum, safe_divide, safe_norm, safe_sqrt
+from ..rotations import apply, apply_transposed, dot, matrix
 
 
 class Moments(NamedTuple):
@@ -30,8 +30,11 @@ class Moments(NamedTuple):
     def moved(self, by: Float[Array, "3 ..."]) -> Moments:
         """The same sums with every position larger by `by`."""
         return Moments(
-            self.n, self.r, self.t + self.n * by, self.u + jnp.sum(self.r * by[:, None], axis=0),
-            self.tt + 2 * jnp.sum(by * self.t, axis=0) + self.n * jnp.sum(by * by, axis=0),
+            self.n,
+            self.r,
+            self.t + self.n * by,
+            self.u + apply_transposed(self.r, by),
+            self.tt + 2 * dot(by, self.t) + self.n * dot(by, by),
         )
 
     def plus(self, other: Moments) -> Moments:
@@ -52,53 +55,118 @@ class Quadratic(NamedTuple):
 def _rows(q: Float[Array, "4 ..."], d: Float[Array, "3 ..."], weight: Float[Array, "..."]) -> Float[Array, "17 ..."]:
     """One frame's contribution to `Moments`."""
     r = matrix(q)
-    u = jnp.sum(r * d[:, None], axis=0)
-    rows = jnp.concatenate([jnp.ones_like(d[:1]), r.reshape(9, *d.shape[1:]), d, u, jnp.sum(d * d, 0)[None]])
+    u = apply_transposed(r, d)
+    rows = jnp.concatenate([jnp.ones_like(d[:1]), r.reshape(9, *d.shape[1:]), d, u, dot(d, d)[None]])
     return jnp.where(weight > 0, rows * weight, 0)
 
 
+class _Layout(NamedTuple):
+    """Which `span` each frame is in (their count: none), frames from begin to the last but one; each span's `origin`."""
+
+    span: Int[Array, "objects frames"]
+    inside: Bool[Array, "objects frames"]
+    origin: Float[Array, "3 objects spans"]
+    shifted: Float[Array, "3 objects frames"]
+
+
+def _at(x: Array, frame: Int[Array, "spans objects"]) -> Array:
+    """Values of (..., objects, frames) arrays at each span's `frame`: (..., objects, spans)."""
+    return jnp.take_along_axis(x, jnp.broadcast_to(frame.T, (*x.shape[:-1], frame.shape[0])), axis=-1)
+
+
+def _layout(t: Array, valid: Array, begin: Array, end: Array, used: Array) -> _Layout:
+    slots, objects = begin.shape
+    frames = valid.shape[-1]
+    lane = jnp.broadcast_to(jnp.arange(objects, dtype=jnp.int32), begin.shape)
+    starts = jnp.zeros((objects, frames + 1), bool).at[lane, jnp.where(used, begin, frames)].set(True)[:, :frames]
+    span = running_count(starts) - 1
+    ended = jnp.take_along_axis(jnp.where(used, end, 0).T, jnp.clip(span, 0, slots - 1), axis=1)
+    inside = valid & (span >= 0) & (jnp.arange(frames, dtype=jnp.int32) < ended)
+    span = jnp.clip(span, 0, slots - 1)
+    origin = _at(t, jnp.where(used, begin, 0))
+    return _Layout(span, inside, origin, t - jnp.take_along_axis(origin, jnp.broadcast_to(span, t.shape), axis=-1))
+
+
+class Place(NamedTuple):
+    """Mean world position of the object's origin over spans (3, spans, objects), and the root mean square distance to it."""
+
+    center: Float[Array, "3 spans objects"]
+    spread: Float[Array, "spans objects"]
+
+
+def span_places(
+    t: Float[Array, "3 objects frames"],
+    valid: Bool[Array, "objects frames"],
+    begin: Int[Array, "spans objects"],
+    end: Int[Array, "spans objects"],
+    used: Bool[Array, "spans objects"],
+) -> Place:
+    """Refit of space constraints: running sums are enough, and no frame is gathered. Spans as for `span_moments`.
+
+    Each frame's origin is a running sum of the steps from one span's first place to the next one's.
+    """
+    objects, frames = valid.shape
+    lane = jnp.broadcast_to(jnp.arange(objects, dtype=jnp.int32), begin.shape)
+    first, last = jnp.where(used, begin, frames), jnp.where(used, end, frames)
+    marks = (
+        jnp.zeros((objects, frames), t.dtype).at[lane, first].add(1, mode="drop").at[lane, last].add(-1, mode="drop")
+    )
+    inside = valid & (running_sum(marks) > 0.5)
+    place = jnp.where(used.T, _at(t, jnp.where(used, begin, 0)), 0)  # (3, objects, spans)
+    step = jnp.where(used.T, place - jnp.concatenate([jnp.zeros_like(place[..., :1]), place[..., :-1]], -1), 0)
+    steps = [jnp.zeros((objects, frames), t.dtype).at[lane, first].add(s.T, mode="drop") for s in step]
+    path = [running_sum(s) for s in steps]
+    d = jnp.stack([x - y for x, y in zip(t, path, strict=True)])
+    begins, ends = jnp.where(used, begin, 0), jnp.where(used, end, 0)
+
+    def between(x: Array) -> Array:
+        """Sum over the frames of each span but its last."""
+        sums = running_sum(jnp.where(inside, x, 0))
+        before = jnp.where(begins.T > 0, _at(sums, jnp.maximum(begins - 1, 0)), 0)
+        return jnp.where(used.T, _at(sums, jnp.maximum(ends - 1, 0)) - before, 0)
+
+    total = jnp.stack([between(x) for x in (jnp.ones_like(t[0]), *d, dot(d, d))])
+    origin = jnp.stack([_at(x, begins) for x in path])
+    end_d = _at(t, ends) - origin  # the last frame may be the next span's first
+    end_row = jnp.concatenate([jnp.ones_like(end_d[:1]), end_d, dot(end_d, end_d)[None]])
+    total = total + jnp.where(_at(valid, ends), end_row, 0)
+    n = jnp.maximum(total[0], 1)
+    center = total[1:4] / n
+    spread = safe_sqrt(jnp.maximum(total[4] / n - dot(center, center), 0))
+    return Place(jnp.swapaxes(center + origin, -1, -2), spread.T)
+
+
 def span_moments(
-    q: Float[Array, "4 objects frames"], t: Float[Array, "3 objects frames"], valid: Bool[Array, "objects frames"],
-    begin: Int[Array, "spans objects"], end: Int[Array, "spans objects"], used: Bool[Array, "spans objects"],
+    q: Float[Array, "4 objects frames"],
+    t: Float[Array, "3 objects frames"],
+    valid: Bool[Array, "objects frames"],
+    begin: Int[Array, "spans objects"],
+    end: Int[Array, "spans objects"],
+    used: Bool[Array, "spans objects"],
 ) -> tuple[Moments, Float[Array, "3 spans objects"]]:
     """Moments of spans in time order that share no frame but one's last with the next one's first; and their origins.
 
     Positions are taken from the object's place at the span's first frame. Unused slots come last; their moments are 0.
     """
-    slots, objects = begin.shape
-    frames = valid.shape[-1]
-    lane = jnp.broadcast_to(jnp.arange(objects, dtype=jnp.int32), begin.shape)
-    starts = jnp.zeros((objects, frames + 1), bool).at[lane, jnp.where(used, begin, frames)].set(True)[:, :frames]
-    span = jnp.clip(running_count(starts) - 1, 0, slots - 1)
-    inside = jnp.arange(frames, dtype=jnp.int32) < jnp.take_along_axis(jnp.where(used, end, 0).T, span, axis=1)
-    inside &= (jnp.cumsum(used, axis=0, dtype=jnp.int32)[-1] > 0)[:, None] & (
-        jnp.arange(frames, dtype=jnp.int32) >= jnp.take_along_axis(begin.T, span, axis=1)
-    )
-    span = jnp.where(inside, span, slots)
-    weight = valid.astype(t.dtype)
-
-    def at(x: Array, frame: Array) -> Array:
-        index = jnp.broadcast_to(jnp.where(used, frame, 0).T, (*x.shape[:-2], objects, slots))
-        return jnp.take_along_axis(x, index, axis=-1)
-
-    origin = at(t, begin)
-    o = jnp.take_along_axis(origin, jnp.broadcast_to(jnp.minimum(span, slots - 1), t.shape), axis=-1)
-    rows = _rows(q, t - o, weight)
-    total = jax.vmap(lambda x, i: jax.ops.segment_sum(x.T, i, slots + 1), in_axes=(1, 0))(rows, span)
+    slots = begin.shape[0]
+    x = _layout(t, valid, begin, end, used)
+    rows = _rows(q, x.shifted, valid.astype(t.dtype))
+    span = jnp.where(x.inside, x.span, slots)
+    total = jax.vmap(lambda r, i: jax.ops.segment_sum(r.T, i, slots + 1), in_axes=(1, 0))(rows, span)
     s = jnp.moveaxis(total[:, :slots], -1, 0)
-    s = s + _rows(at(q, end), at(t, end) - origin, jnp.where(used.T, at(weight, end), 0))  # the last frame may be the next one's first
+    last = jnp.where(used, end, 0)
+    weight = jnp.where(used.T, _at(valid, last), False).astype(t.dtype)
+    s = s + _rows(_at(q, last), _at(t, last) - x.origin, weight)  # the last frame may be the next one's first
     s = jnp.swapaxes(s, -1, -2)
-    return Moments(s[0], s[1:10].reshape(3, 3, *s.shape[1:]), s[10:13], s[13:16], s[16]), jnp.swapaxes(origin, -1, -2)
+    return Moments(s[0], s[1:10].reshape(3, 3, *s.shape[1:]), s[10:13], s[13:16], s[16]), jnp.swapaxes(x.origin, -1, -2)
 
 
 def quadratic(x: Moments) -> Quadratic:
     """The mean squared motion of every body point."""
     n = jnp.maximum(x.n, 1)
     r, t, u = x.r / n, x.t / n, x.u / n
-    eye = jnp.eye(3, dtype=t.dtype).reshape(3, 3, *([1] * x.n.ndim))
-    m = eye - jnp.sum(r[:, :, None] * r[:, None, :], axis=0)
-    b = u - jnp.sum(r * t[:, None], axis=0)
-    return Quadratic(m, b, x.tt / n - jnp.sum(t * t, axis=0), r, t)
+    m = jnp.stack([jnp.stack([(1 if i == j else 0) - dot(r[:, i], r[:, j]) for j in range(3)]) for i in range(3)])
+    return Quadratic(m, u - apply_transposed(r, t), x.tt / n - dot(t, t), r, t)
 
 
 def solve_symmetric(m: Float[Array, "3 3 ..."], b: Float[Array, "3 ..."]) -> Float[Array, "3 ..."]:
@@ -115,9 +183,9 @@ def solve_symmetric(m: Float[Array, "3 3 ..."], b: Float[Array, "3 ..."]) -> Flo
 
 def pivot_energy(e: Quadratic, ridge: Float[Array, ""]) -> tuple[Float[Array, "..."], Float[Array, "3 ..."]]:
     """Mean squared motion that the best pivot leaves, `c - b^T (M + ridge I)^-1 b`, and that body point."""
-    eye = jnp.eye(3, dtype=e.c.dtype).reshape(3, 3, *([1] * e.c.ndim))
-    p = -solve_symmetric(e.m + ridge * eye, e.b)
-    return jnp.maximum(e.c + jnp.sum(e.b * p, axis=0), 0), p
+    m = jnp.stack([e.m[i].at[i].add(ridge) for i in range(3)])
+    p = -solve_symmetric(m, e.b)
+    return jnp.maximum(e.c + dot(e.b, p), 0), p
 
 
 class Fit(NamedTuple):
@@ -147,15 +215,15 @@ def fit(x: Moments, line_below: Float[Array, "..."], noise: Float[Array, "..."],
     vectors = jnp.moveaxis(vectors, 0, -1).reshape(3, 3, *shape)  # columns: eigenvectors
     floor = 32 * jnp.finfo(values.dtype).eps
     line = (values[0] <= jnp.minimum(line_below, ratio * values[1])) | (values[0] <= noise)
-    along = jnp.sum(vectors * e.b[:, None], axis=0)
+    along = apply_transposed(vectors, e.b)
     solid = (values > floor).at[0].set((values[0] > floor) & ~line)  # along its axis a line's pivot is free
     inverse = jnp.where(solid, 1 / jnp.where(solid, values, 1), 0)
-    p = -jnp.sum(vectors * (inverse * along)[None], axis=1)
-    energy = jnp.maximum(e.c - jnp.sum(inverse * along**2, axis=0), 0)
-    point = jnp.sum(e.r * p[None], axis=1) + e.t
-    axis = jnp.sum(e.r * vectors[:, 0][None], axis=1)
+    p = -apply(vectors, inverse * along)
+    energy = jnp.maximum(e.c - dot(inverse * along, along), 0)
+    point = apply(e.r, p) + e.t
+    axis = apply(e.r, vectors[:, 0])
     axis = safe_divide(axis, safe_norm(axis, axis=0))
-    nearest = point + axis * jnp.sum(axis * (e.t - point), axis=0)
+    nearest = point + axis * dot(axis, e.t - point)
     return Fit(
         values, jnp.where(line, nearest, point), axis, safe_sqrt(energy), e.t, safe_sqrt(jnp.maximum(e.c, 0)), line
     )

@@ -35,6 +35,10 @@ class Segments:
     pattern: Int[Array, " found"]
 
 
+def _triple(x: np.ndarray) -> tuple[float, float, float]:
+    return float(x[0]), float(x[1]), float(x[2])
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Detection:
@@ -79,8 +83,8 @@ class Detection:
                 type=(kind := TYPES[int(s.type[i])]),
                 begin=int(s.begin[i]),
                 end=int(s.end[i]),
-                position=tuple(float(x) for x in s.position[i]),
-                axis=tuple(float(x) for x in s.axis[i]) if kind == "line" else None,
+                position=_triple(s.position[i]),
+                axis=_triple(s.axis[i]) if kind == "line" else None,
                 residual=float(s.residual[i]),
                 pattern=int(s.pattern[i]),
                 fps=rate,
@@ -90,19 +94,34 @@ class Detection:
 
     def annotations(self) -> Annotations:
         """What of this goes into a file."""
-        return Annotations(self.clip, float(self.rate), self.frames, self.constraints, self.patterns, self.warnings, "m", self.settings.method)
+        return Annotations(
+            self.clip,
+            float(self.rate),
+            self.frames,
+            self.constraints,
+            self.patterns,
+            self.warnings,
+            "m",
+            self.settings.method,
+        )
 
     def save(self, path: str | Path) -> Path:
         """Write the annotations; the suffix chooses the format: .json, .csv, .parquet, or .npz (per frame)."""
         from ..formats import write_annotations
 
-        return write_annotations(path, self.annotations())
+        return write_annotations(path, self.annotations(), objects=self.objects)
 
     def __str__(self) -> str:
         head = f"{self.clip or 'clip'}: {self.frames} frames at {float(self.rate):g} fps, method {self.settings.method}"
         return "\n".join([head, str(self.constraints), *(f"warning: {w}" for w in self.warnings)])
 
 
-for _record, _data in ((NoisePattern, ("sigma_max", "eps_max")), (Constraint, ("position", "axis", "residual")), (Constraints, ("items",))):
+for _record, _data in (
+    (NoisePattern, ("sigma_max", "eps_max")),
+    (Constraint, ("position", "axis", "residual")),
+    (Constraints, ("items",)),
+):
     _names = [f for f in _record.__dataclass_fields__]
-    jax.tree_util.register_dataclass(_record, data_fields=list(_data), meta_fields=[n for n in _names if n not in _data])
+    jax.tree_util.register_dataclass(
+        _record, data_fields=list(_data), meta_fields=[n for n in _names if n not in _data]
+    )

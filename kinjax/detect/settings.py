@@ -88,7 +88,9 @@ class Settings:
         if self.rate is not None and not self.rate > 0:
             raise OptionError(f"rate={self.rate}: it must be a positive number of frames a second")
         if self.thresholds is not None and self.method != "paper":
-            raise OptionError('thresholds are those of one interval: they go with method="paper"; the robust method has still=(m/s, rad/s)')
+            raise OptionError(
+                'thresholds are those of one interval: they go with method="paper"; the robust method has still=(m/s, rad/s)'
+            )
 
     def but(self, **changes: Any) -> Settings:
         """These settings with some changed; an unknown name is an `OptionError` that lists the nearest."""

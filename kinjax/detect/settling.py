@@ -30,7 +30,12 @@ class Poses(NamedTuple):
 
 
 def settle(
-    spans: Spans, raw: Poses, mean: Poses, noise: tuple[Float[Array, " objects"], Float[Array, " objects"]], span: int, most: int
+    spans: Spans,
+    raw: Poses,
+    mean: Poses,
+    noise: tuple[Float[Array, " objects"], Float[Array, " objects"]],
+    span: int,
+    most: int,
 ) -> Spans:
     """Each span with up to `most` more frames at either end, as long as each is seen and in the same place.
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics import safe_norm
+from ..numerics import safe_norm, safe_sqrt
 from ..rotations import cross, dot
 from .displacements import Displacement
 
@@ -43,19 +43,21 @@ def sigma_epsilon(x: Displacement) -> tuple[Array, Array, Array, Array]:
     A rotation by `theta` about `a` has `R - I` with singular values `2 sin(theta/2)` twice and 0, so `sigma_3 = 2 |v|`,
     `eps_3 = |t|`, `sigma_1 = 0`, `eps_1 = |a . t|`; a displacement without rotation has all of them zero and `eps_1 = |t|`.
     """
-    two = jnp.asarray(2.0, x.w.dtype)
-    s = safe_norm(x.v, axis=0)
-    eps_3 = safe_norm(x.d, axis=0)
-    turning = two * s > FLOOR_EPS * jnp.finfo(s.dtype).eps
+    # no scaling before the squares: |v| <= 1, and displacements are neither 1e-19 m nor 1e19 m
+    s = safe_sqrt(dot(x.v, x.v))
+    eps_3 = safe_sqrt(dot(x.d, x.d))
+    turning = s > FLOOR_EPS / 2 * jnp.finfo(s.dtype).eps
     along = jnp.abs(dot(x.v, x.d)) / jnp.where(turning, s, jnp.ones_like(s))
-    return two * s, eps_3, jnp.zeros_like(s), jnp.where(turning, along, eps_3)
+    return s + s, eps_3, jnp.zeros_like(s), jnp.where(turning, along, eps_3)
 
 
 def project(x: Displacement) -> SigmaEpsilon:
     """Closed form of the whole projection; angles near pi lose nothing, at rest the axis is 0 and the point 0."""
     sigma_3, eps_3, sigma_1, eps_1 = sigma_epsilon(x)
     turning = sigma_3 > FLOOR_EPS * jnp.finfo(sigma_3.dtype).eps
-    s = jnp.where(turning, sigma_3 / 2, 1)  # selected before the divisions: their gradients overflow long before they do
+    s = jnp.where(
+        turning, sigma_3 / 2, 1
+    )  # selected before the divisions: their gradients overflow long before they do
     axis = jnp.where(turning, x.v, 0) / s
     across = x.d - axis * dot(axis, x.d)
     # (R - I) p + t = 0 across the axis: p = t/2 + cot(theta/2) a x t / 2
@@ -92,4 +94,6 @@ def project_by_svd(x: Displacement) -> SigmaEpsilon:
     flat = rotation.reshape(3, 3, -1).transpose(2, 0, 1), x.d.reshape(3, -1).T
     out = jax.vmap(project_svd)(*flat)
     shape = x.w.shape
-    return SigmaEpsilon(*(y.reshape(shape) for y in out[:4]), out.point.T.reshape(3, *shape), out.axis.T.reshape(3, *shape))
+    sigma_3, eps_3, sigma_1, eps_1 = (y.reshape(shape) for y in out[:4])
+    point, axis = out.point.T.reshape(3, *shape), out.axis.T.reshape(3, *shape)
+    return SigmaEpsilon(sigma_3, eps_3, sigma_1, eps_1, point, axis)

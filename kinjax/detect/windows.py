@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..rotations import matrix
+from ..rotations import apply_transposed, dot, matrix
 from .refit import Moments, pivot_energy, quadratic
 
 
@@ -39,8 +39,14 @@ class Windows(NamedTuple):
 
 
 def window_rewards(
-    q: Float[Array, "4 objects frames"], t: Float[Array, "3 objects frames"], valid: Bool[Array, "objects frames"],
-    blocked: Bool[Array, "objects frames"], shortest: int, longest: int, reward: Reward, rest: bool,
+    q: Float[Array, "4 objects frames"],
+    t: Float[Array, "3 objects frames"],
+    valid: Bool[Array, "objects frames"],
+    blocked: Bool[Array, "objects frames"],
+    shortest: int,
+    longest: int,
+    reward: Reward,
+    rest: bool,
 ) -> Float[Array, "lengths objects frames"]:
     """Reward of every window of `shortest..longest` frames, at its **last** frame; -inf where it is not allowed.
 
@@ -51,9 +57,9 @@ def window_rewards(
     nu2 = (reward.nu**2)[:, None]
     pad = [(0, 0)] * (t.ndim - 1) + [(0, longest)]
     weight = valid.astype(t.dtype)
-    rows = jnp.concatenate([
-        matrix(q).reshape(9, *valid.shape) * weight, t, weight[None], blocked.astype(t.dtype)[None]
-    ])
+    rows = jnp.concatenate(
+        [matrix(q).reshape(9, *valid.shape) * weight, t, weight[None], blocked.astype(t.dtype)[None]]
+    )
     rows = jnp.pad(rows, pad)
     start_ok = valid
     at = jnp.arange(frames, dtype=jnp.int32)
@@ -63,8 +69,7 @@ def window_rewards(
         ahead = jax.lax.dynamic_slice_in_dim(rows, length - 1, frames, axis=-1)
         r, w = ahead[:9].reshape(3, 3, *valid.shape), ahead[12]
         d = w * (ahead[9:12] - t)
-        u = jnp.sum(r * d[:, None], axis=0)
-        moments = moments.plus(Moments(w, r, d, u, jnp.sum(d * d, axis=0)))
+        moments = moments.plus(Moments(w, r, d, apply_transposed(r, d), dot(d, d)))
         stopped = stopped + ahead[13]
         e = quadratic(moments)
         if rest:
@@ -72,7 +77,7 @@ def window_rewards(
             near = jnp.ones_like(valid)
         else:
             energy, p = pivot_energy(e, reward.ridge)
-            near = jnp.sum(p * p, axis=0) <= reward.reach**2
+            near = dot(p, p) <= reward.reach**2
         earned = moments.n * (reward.beta - energy / nu2) - reward.opening
         allowed = near & start_ok & (w > 0) & (stopped == 0) & (at + length <= frames)
         return (moments, stopped), jnp.where(allowed, earned, -jnp.inf)
