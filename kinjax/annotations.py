@@ -156,7 +156,8 @@ class NoisePattern:
     """The thresholds that decide, for one object and one constraint type (paper, section 6), as control points in time.
 
     `frames` (K,) control-point frames (empty: constant); `sigma_max` and `eps_max` (K,) or (1,): per interval for
-    `method="paper"` (radians approximately, as singular values; metres), per second for `"robust"` (rad/s, m/s).
+    `method="paper"` (radians approximately, as singular values; metres), per second for `"robust"` (rad/s, m/s);
+    per window for its line and point constraints (`eps_max`: the noise in metres that a pivot is measured against).
     `intervals`: template intervals used; `kept`: those that the least median of squares kept. `status` names what is
     worth knowing: `ok, few_intervals, exact_fit, ambiguous, unrepresentative, template_moving, automatic, given`,
     several joined by `+`. `templates` are those that it came from.
@@ -173,7 +174,7 @@ class NoisePattern:
     kept: int = 0
     status: str = "ok"
     templates: tuple[Template, ...] = field(default=())
-    unit: Literal["per_interval", "per_second"] = "per_interval"
+    unit: Literal["per_interval", "per_second", "per_window"] = "per_interval"
 
     def with_object(self, name: str) -> NoisePattern:
         """The same thresholds for another object."""

@@ -230,3 +230,20 @@ def test_shapes_are_checked():
 
 def test_settings_are_hashable_and_checked():
     assert hash(Settings()) == hash(Settings()) and Settings().but(types=("LINE",)).types == ("line",)
+
+
+def test_line_templates_teach_the_noise_of_pivots(foot):
+    noisy = synthetic.with_noise(foot, 0.003, 2).poses
+    toe = foot.truth.of("foot", "line")[1]
+    options = {"types": ("space", "line", "point"), "templates": [Template("foot", toe.begin, toe.end, "line")]}
+    taught, untaught = detect(noisy, **options), detect(noisy, types=options["types"])
+    line = next(p for p in taught.patterns if p.unit == "per_window")
+    assert line.status == "ok" and line.eps_max[0] >= 0.003
+    again = detect(noisy, types=options["types"], patterns=calibrate(noisy, options["templates"]))
+    assert spans(again) == spans(taught)
+    assert len(taught.constraints.of("foot", "line")) == len(untaught.constraints.of("foot", "line")) == 6
+
+
+def test_a_template_of_a_type_that_is_not_asked_for_is_an_error(foot):
+    with pytest.raises(TemplateError, match="asked for"):
+        detect(foot.poses, templates=[Template("foot", 92, 114, "line")])

@@ -23,7 +23,7 @@ from .instantaneous import LINE, NONE, POINT, SPACE, instantaneous
 from .interface import Clip, Found, Joints, Numbers, Plan, TemplateSpans
 from .merging import Elements, Spans, absorb_short_rests, elements, merge, runs
 from .noise import Pattern
-from .pivots import merged_pivots
+from .pivots import merged_pivots, template_noise
 from .refit import fit, span_moments, span_places
 from .settling import Poses, settle
 from .sigma_epsilon import SigmaEpsilon, project, project_by_svd
@@ -73,13 +73,16 @@ def run(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, give
             plan.mean + (plan.span + 1) // 2,
         )
     found, overflow = _refit(plan, numbers, spans, clip), items.total
+    pivot_noise = jnp.maximum(numbers.pivot_noise, nu[0])
     if plan.lines and not paper:
+        if plan.templates:
+            pivot_noise = jnp.maximum(pivot_noise, template_noise(*clip, *templates[1]))
         long = (spans.last - spans.first) >= numbers.least
         space = jnp.where(long, spans.kind, NONE), spans.first, spans.last
         pivots, more = merged_pivots(
             *clip,
             space,
-            jnp.maximum(numbers.pivot_noise, nu[0]),
+            pivot_noise,
             nu[1],
             plan.pivot,
             plan.free_pivots,
@@ -103,6 +106,7 @@ def run(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, give
         limits,
         patterns,
         nu,
+        pivot_noise,
         jnp.sum(seen & ~valid, axis=-1, dtype=jnp.int32),
         jnp.where(asked & (end - begin >= numbers.least), kind, NONE),
         begin,

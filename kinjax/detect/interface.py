@@ -54,7 +54,7 @@ class Numbers(NamedTuple):
     margin: Float[Array, ""]
     axis_min: Float[Array, ""]
     spike: Float[Array, ""]
-    pivot_noise: Float[Array, ""]
+    pivot_noise: Float[Array, " objects"]
     pivot_reach: Float[Array, ""]
     least: Int[Array, ""]
     tolerance: Tolerance
@@ -98,6 +98,7 @@ class Found(NamedTuple):
     limits: tuple[tuple[Float[Array, "objects n"], Float[Array, "objects n"]], ...]
     patterns: tuple[Pattern, ...]
     noise: tuple[Float[Array, " objects"], Float[Array, " objects"]]
+    pivot_noise: Float[Array, " objects"]
     missing: Int[Array, " objects"]
     kind: Int[Array, "slots objects"]
     begin: Int[Array, "slots objects"]

@@ -19,7 +19,7 @@ from ..motion import Motion, Poses
 from ..numerics import BLOCK, bucket
 from .engine import joint_poses, run_joints, run_poses
 from .interface import Clip, Found, Joints, Plan
-from .planning import CAPACITY, given_patterns, numbers, plan_of, template_spans
+from .planning import CAPACITY, given_patterns, numbers, pivot_patterns, plan_of, template_spans
 from .prepare import Prepared, padded_clip, prepared
 from .records import detection, kinds_of, pattern_records, unit_of
 from .results import Detection
@@ -120,14 +120,15 @@ def _run(
             'method="paper" needs a template, a pattern or thresholds=(sigma_max, eps_max); method="robust" needs none'
         )
     spans, slots, length = template_spans(templates, clip, settings, plan.span, kinds)
-    given = given_patterns(patterns, clip, unit_of(settings), kinds) if patterns else ()
+    given = given_patterns(patterns, clip, unit_of(settings), kinds[: 1 if settings.method != "paper" else None]) if patterns else ()
     if clip.frames <= plan.span:
         raise OptionError(
             f"{clip.clip or 'clip'}: {clip.frames} frame{'s' * (clip.frames != 1)} cannot hold a displacement over {plan.span}: "
             "nothing to detect in so short a clip"
         )
     plan = replace(plan, templates=slots, template_frames=length)
-    arguments = numbers(settings, clip.rate), clip.arrays, spans, given
+    pivots = pivot_patterns(patterns, clip)
+    arguments = numbers(settings, clip.rate, pivots), clip.arrays, spans, given
     run = run_joints if isinstance(clip.arrays, Joints) else run_poses
     while True:
         found = run(plan, *arguments)

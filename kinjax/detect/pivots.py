@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ..numerics import safe_sqrt
 from ..rotations import dot
 from .instantaneous import LINE, NONE, POINT, SPACE
 from .merging import Spans, elements, packed
@@ -72,6 +73,21 @@ def merged_pivots(
         used &= _touching(spans, used, space, jnp.asarray(TOUCH, dtype) * rate)
     kind = jnp.where(used, jnp.where(found.is_line, LINE, POINT), NONE)
     return (kind, spans.first, spans.last, found.point + origin, found.axis, found.residual), items.total
+
+
+def template_noise(
+    q: Float[Array, "4 objects frames"],
+    t: Float[Array, "3 objects frames"],
+    valid: Bool[Array, "objects frames"],
+    begin: Int[Array, "objects templates"],
+    end: Int[Array, "objects templates"],
+    used: Bool[Array, "objects templates"],
+) -> Float[Array, " objects"]:
+    """Root mean square motion in metres that the best pivot of a line or point template leaves; the largest of them, 0 for
+    an object without one."""
+    moments, _ = span_moments(q, t, valid, begin.T, end.T, used.T)
+    energy, _ = pivot_energy(quadratic(moments), jnp.asarray(RIDGE, t.dtype))
+    return jnp.max(jnp.where(used.T, safe_sqrt(energy), 0), axis=0)
 
 
 def _inside(space: tuple[Array, ...], frames: int) -> Bool[Array, "objects frames"]:

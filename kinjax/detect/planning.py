@@ -40,8 +40,8 @@ def widths(settings: Settings, rate: float) -> dict[str, int | tuple[int, int]]:
     }
 
 
-def numbers(settings: Settings, rate: float) -> Numbers:
-    """Settings that are data, as arrays."""
+def numbers(settings: Settings, rate: float, pivot_noise: np.ndarray) -> Numbers:
+    """Settings that are data, as arrays; `pivot_noise` (lanes,) in metres by object."""
     dtype = working_dtype()
     f = lambda x: jnp.asarray(x, dtype)  # noqa: E731
     count = lambda s, least=0: jnp.asarray(max(least, int(np.floor(s * rate + 0.5))), jnp.int32)  # noqa: E731
@@ -55,7 +55,7 @@ def numbers(settings: Settings, rate: float) -> Numbers:
         f(settings.margin),
         f(settings.axis_min),
         f(settings.spike),
-        f(settings.pivot_noise),
+        f(np.maximum(pivot_noise, settings.pivot_noise)),
         f(settings.pivot_reach),
         count(settings.min_duration, 1),
         Tolerance(
@@ -98,8 +98,9 @@ def template_spans(
             raise TemplateTooShort(
                 f"{where}: {label} has fewer than 3 displacements in which the object is seen (the rest is NaN or masked)"
             )
-        if kind in kinds:
-            by.setdefault((kind, lane), []).append((begin, end))
+        if kind not in kinds:
+            raise TemplateError(f"{where}: {label} is a {t.type} template, but only {', '.join(settings.types)} is asked for")
+        by.setdefault((kind, lane), []).append((begin, end))
     slots, longest = 0, 0
     for (kind, lane), spans in by.items():
         spans.sort()
@@ -124,6 +125,16 @@ def template_spans(
     return tuple(out), slots, bucket(longest)
 
 
+def pivot_patterns(patterns: Sequence[NoisePattern], clip: Prepared) -> np.ndarray:
+    """Noise in metres that each lane's pivots are measured against, as far as patterns say it (else 0)."""
+    out = np.zeros(clip.lanes)
+    for p in patterns:
+        if p.unit == "per_window" and p.object.casefold() in (n.casefold() for n in clip.names):
+            lane = find_name(p.object, clip.names, "object", clip.clip or "clip")
+            out[lane] = max(out[lane], *p.eps_max)
+    return out
+
+
 def given_patterns(
     patterns: Sequence[NoisePattern], clip: Prepared, unit: str, kinds: Sequence[str]
 ) -> tuple[Pattern, ...]:
@@ -132,12 +143,14 @@ def given_patterns(
     lanes = clip.lanes
     mine: dict[tuple[str, int], NoisePattern] = {}
     for p in patterns:
+        if p.unit == "per_window" and unit == "per_second":
+            continue  # `pivot_patterns` takes these
         if p.unit != unit:
             raise OptionError(
                 f"the pattern of {p.object!r} is {p.unit}, this method needs one {unit}: calibrate with the same method"
             )
         if p.object.casefold() in (n.casefold() for n in clip.names):
-            mine[("space" if p.type == "space" else "line", find_name(p.object, clip.names, "object", where))] = p
+            mine["space" if p.type == "space" else "line", find_name(p.object, clip.names, "object", where)] = p
     size = max([2, *(2 * ((len(p.sigma_max) + 1) // 2) for p in mine.values())])
     size = 2 << (max(1, size // 2) - 1).bit_length()
     dtype, out = working_dtype(), []

@@ -36,8 +36,8 @@ _WORDS = {
 
 
 def kinds_of(plan: Plan) -> tuple[str, ...]:
-    """The pattern types of a plan, in the engine's order."""
-    return ("space",) * plan.space + ("line",) * (plan.method == "paper" and plan.lines)
+    """The template types of a plan, in the engine's order."""
+    return ("space",) * plan.space + ("line",) * plan.lines
 
 
 def unit_of(settings: Settings) -> str:
@@ -80,7 +80,7 @@ def detection(
         host.residual[slot, lane],
         np.asarray(which, int),
     )
-    kinds: tuple[Any, ...] = kinds_of(plan)
+    kinds: tuple[Any, ...] = kinds_of(plan)[: len(host.limits)]
     middle = (np.arange(n) + (0.5 if settings.method == "paper" else plan.span / 2)) * scale
     template = np.zeros((n, objects), int)
     for m in host.marks:
@@ -116,7 +116,7 @@ def pattern_records(
     """The engine's patterns as records: one for each object and type."""
     out = []
     scale = clip.original_rate / clip.rate
-    for kind, pattern, limit in zip(kinds_of(plan), host.patterns, host.limits, strict=True):
+    for kind, pattern, limit in zip(kinds_of(plan)[: len(host.limits)], host.patterns, host.limits, strict=True):
         for lane, name in enumerate(clip.names):
             count = int(pattern.size[lane])
             mine = tuple(
@@ -161,6 +161,17 @@ def pattern_records(
                         unit=unit_of(settings),  # type: ignore[arg-type]
                     )
                 )
+    if plan.lines and plan.method != "paper":
+        asked = "line" if "line" in settings.types else "point"
+        for lane, name in enumerate(clip.names):
+            mine = tuple(t for t in templates if t.object.casefold() == name.casefold() and t.type != "space")
+            out.append(
+                NoisePattern(
+                    name, asked, (0.0,), (float(host.pivot_noise[lane]),), (), settings.alpha_max, settings.dist_max,
+                    sum(t.end - t.begin for t in mine), sum(t.end - t.begin for t in mine), "ok" if mine else "automatic",
+                    mine, "per_window",
+                )  # fmt: skip
+            )
     return tuple(out)
 
 

@@ -59,7 +59,7 @@ class _Pattern(_Strict):
     kept: int
     status: str
     templates: tuple[_Template, ...]
-    unit: Literal["per_interval", "per_second"]
+    unit: Literal["per_interval", "per_second", "per_window"]
 
 
 class _Annotations(_Strict):
