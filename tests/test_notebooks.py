@@ -1,0 +1,19 @@
+"""Every notebook runs from its first cell to its last, as a script, without a warning."""
+
+from pathlib import Path
+
+import jupytext
+import pytest
+
+NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.py"))
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+def test_notebook_runs(path, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    notebook = jupytext.read(path)
+    cells = [c.source for c in notebook.cells if c.cell_type == "code"]
+    assert len(cells) > 5 and any(c.cell_type == "markdown" for c in notebook.cells)
+    names = {"__name__": "__main__"}
+    for i, source in enumerate(cells):
+        exec(compile(source, f"{path.name} cell {i}", "exec"), names)
