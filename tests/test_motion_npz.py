@@ -12,7 +12,15 @@ import numpy as np
 import pytest
 
 from kinjax.errors import FileFormatError, OptionError, ShapeError
-from kinjax.formats import load, npz_container, read_bvh, read_motion_npz, read_poses_npz, write_motion_npz, write_poses_npz
+from kinjax.formats import (
+    load,
+    npz_container,
+    read_bvh,
+    read_motion_npz,
+    read_poses_npz,
+    write_motion_npz,
+    write_poses_npz,
+)
 from kinjax.motion import Motion, Poses, make_poses
 from kinjax.skeleton import Skeleton, Topology
 

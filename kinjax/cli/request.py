@@ -22,7 +22,6 @@ from ..motion import Motion, Poses
 from .options import Detecting, Reading
 
 Clip = Motion | Poses
-POSES = "kinjax-poses/"  # what an .npz file of poses says it is
 SUFFIXES = (".json", ".csv", ".parquet", ".npz")  # of annotations
 
 
@@ -41,19 +40,14 @@ def check_file(path: Path, what: str = "clip") -> Path:
 
 def load_clip(path: Path, reading: Reading) -> Clip:
     """The clip in a file: a motion, or poses (.npz)."""
-    from ..formats import load, read_poses_npz
+    from ..formats import load
 
     options = {k: v for k, v in (("unit", reading.unit), ("up", reading.up)) if v not in ("auto", None)}
     if check_file(path).suffix.lower() != ".npz":
         return load(path, **options)
     if options:
         raise OptionError(f"{path.name} says its own unit and axes (npz): --unit and --up go with BVH")
-    try:
-        return load(path)
-    except FileFormatError as error:
-        if POSES in error.found:  # the file says that it is another kind of ours
-            return read_poses_npz(path)
-        raise
+    return load(path)
 
 
 @dataclass(frozen=True)

@@ -120,7 +120,11 @@ def _run(
             'method="paper" needs a template, a pattern or thresholds=(sigma_max, eps_max); method="robust" needs none'
         )
     spans, slots, length = template_spans(templates, clip, settings, plan.span, kinds)
-    given = given_patterns(patterns, clip, unit_of(settings), kinds[: 1 if settings.method != "paper" else None]) if patterns else ()
+    given = (
+        given_patterns(patterns, clip, unit_of(settings), kinds[: 1 if settings.method != "paper" else None])
+        if patterns
+        else ()
+    )
     if clip.frames <= plan.span:
         raise OptionError(
             f"{clip.clip or 'clip'}: {clip.frames} frame{'s' * (clip.frames != 1)} cannot hold a displacement over {plan.span}: "

@@ -99,7 +99,9 @@ def template_spans(
                 f"{where}: {label} has fewer than 3 displacements in which the object is seen (the rest is NaN or masked)"
             )
         if kind not in kinds:
-            raise TemplateError(f"{where}: {label} is a {t.type} template, but only {', '.join(settings.types)} is asked for")
+            raise TemplateError(
+                f"{where}: {label} is a {t.type} template, but only {', '.join(settings.types)} is asked for"
+            )
         by.setdefault((kind, lane), []).append((begin, end))
     slots, longest = 0, 0
     for (kind, lane), spans in by.items():

@@ -167,10 +167,19 @@ def pattern_records(
             mine = tuple(t for t in templates if t.object.casefold() == name.casefold() and t.type != "space")
             out.append(
                 NoisePattern(
-                    name, asked, (0.0,), (float(host.pivot_noise[lane]),), (), settings.alpha_max, settings.dist_max,
-                    sum(t.end - t.begin for t in mine), sum(t.end - t.begin for t in mine), "ok" if mine else "automatic",
-                    mine, "per_window",
-                )  # fmt: skip
+                    name,
+                    asked,
+                    (0.0,),
+                    (float(host.pivot_noise[lane]),),
+                    (),
+                    settings.alpha_max,
+                    settings.dist_max,
+                    sum(t.end - t.begin for t in mine),
+                    sum(t.end - t.begin for t in mine),
+                    "ok" if mine else "automatic",
+                    mine,
+                    "per_window",
+                )
             )
     return tuple(out)
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import FileFormatError, OptionError
 
 if TYPE_CHECKING:
-    from ..motion import Motion
+    from ..motion import Motion, Poses
 
 _ROOMS = {
     "bvh": ("parse_bvh", "read_bvh"),
@@ -43,16 +43,21 @@ def __dir__() -> list[str]:
     return __all__
 
 
-def load(path: str | Path, **options: Any) -> Motion:
-    """The motion in a file; the suffix (any case) chooses the reader: .bvh or .npz.
+def load(path: str | Path, **options: Any) -> Motion | Poses:
+    """The motion in a file; the suffix (any case) chooses the reader: .bvh or .npz. An .npz of poses gives `Poses`.
 
     `options` go to that reader (`read_bvh`: unit, up). Raises `FileFormatError` for another suffix or a broken file.
     """
-    reader = _READERS.get(Path(path).suffix.lower())
-    if reader is None:
+    suffix = Path(path).suffix.lower()
+    if suffix not in _READERS:
         found = f"no motion format has the suffix {Path(path).suffix!r}"
         raise FileFormatError(found, path=path, remedy=f"motion is read from {', '.join(_READERS)}")
-    return __getattr__(reader)(path, **options)
+    try:
+        return __getattr__(_READERS[suffix])(path, **options)
+    except FileFormatError as error:
+        if suffix == ".npz" and "kinjax-poses/" in error.found:  # the file says that it is our other kind
+            return __getattr__("read_poses_npz")(path, **options)
+        raise
 
 
 def save(path: str | Path, motion: Motion, **options: Any) -> Path:
