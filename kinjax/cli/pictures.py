@@ -13,7 +13,7 @@ from ..errors import FileFormatError, OptionError
 from ..motion import Motion
 from .cache import use_cache
 from .options import Plot
-from .request import POSES, SUFFIXES, check_file, load_clip
+from .request import SUFFIXES, check_file, load_clip
 from .show import Screen, summary
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def annotations_in(path: Path) -> Annotations | None:
     try:
         return read_annotations(path)
     except FileFormatError as error:
-        if path.suffix.lower() == ".npz" and ("kinjax-motion/" in error.found or POSES in error.found):
+        if path.suffix.lower() == ".npz" and ("kinjax-motion/" in error.found or "kinjax-poses/" in error.found):
             return None
         raise
 

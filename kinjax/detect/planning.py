@@ -23,6 +23,8 @@ from .settings import Settings
 
 CAPACITY = 64
 """Elements that the merging scan holds at first; a clip with more is run again with enough."""
+LINE_CAPACITY = 512
+"""The same where every line displacement is an element (the paper's method)."""
 
 
 def widths(settings: Settings, rate: float) -> dict[str, int | tuple[int, int]]:
@@ -106,10 +108,10 @@ def template_spans(
     slots, longest = 0, 0
     for (kind, lane), spans in by.items():
         spans.sort()
-        for a, b in pairwise(spans):
-            if b[0] < a[1]:
+        for one, two in pairwise(spans):
+            if two[0] < one[1]:
                 raise TemplateError(
-                    f"{where}: two {kind} templates of {clip.names[lane]} overlap: {a[0]}:{a[1]} and {b[0]}:{b[1]}"
+                    f"{where}: two {kind} templates of {clip.names[lane]} overlap: {one[0]}:{one[1]} and {two[0]}:{two[1]}"
                 )
         slots, longest = max(slots, len(spans)), max(longest, *(e - b for b, e in spans))
     if not slots:
@@ -119,10 +121,10 @@ def template_spans(
     out = []
     for kind in kinds:
         table = np.zeros((3, lanes, slots), np.int32)
-        for (k, lane), spans in by.items():
+        for (k, at), placed in by.items():
             if k == kind:
-                for i, (b, e) in enumerate(spans):
-                    table[:, lane, i] = b, e, 1
+                for i, (b, e) in enumerate(placed):
+                    table[:, at, i] = b, e, 1
         out.append(Spans(jnp.asarray(table[0]), jnp.asarray(table[1]), jnp.asarray(table[2] > 0)))
     return tuple(out), slots, bucket(longest)
 

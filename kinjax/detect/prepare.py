@@ -126,7 +126,7 @@ def prepared(
     poses = resampled(poses, settings.rate)
     if poses.objects == 0:
         raise OptionError("no object to look at")
-    valid = np.array(poses.valid, bool).T
+    valid: Any = np.array(poses.valid, bool).T
     t = np.asarray(poses.position, float)
     first = np.argmax(valid, axis=1)
     origin = np.where(valid.any(1)[:, None] & near, t[first, np.arange(poses.objects)], 0.0)

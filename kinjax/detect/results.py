@@ -109,7 +109,8 @@ class Detection:
         """Write the annotations; the suffix chooses the format: .json, .csv, .parquet, or .npz (per frame)."""
         from ..formats import write_annotations
 
-        return write_annotations(path, self.annotations(), objects=self.objects)
+        columns = self.objects if Path(path).suffix.lower() == ".npz" else None
+        return write_annotations(path, self.annotations(), objects=columns)
 
     def __str__(self) -> str:
         head = f"{self.clip or 'clip'}: {self.frames} frames at {float(self.rate):g} fps, method {self.settings.method}"
