@@ -171,7 +171,7 @@ def window_stage() -> None:
     import jax
     import jax.numpy as jnp
 
-    from kinjax.detect.engine import Clip
+    from kinjax.detect.interface import Clip
     from kinjax.detect.prepare import prepared
     from kinjax.detect.settings import Settings
     from kinjax.detect.windows import Reward, best_segmentation, window_rewards
@@ -179,7 +179,8 @@ def window_stage() -> None:
 
     poses = object_poses(walking_crowd(2048), ["j3", "j7", "j15", "j30"])
     arrays = prepared(poses, None, None, Settings()).arrays
-    clip = Clip(*map(jnp.asarray, arrays))
+    clip = Clip(*(jnp.swapaxes(jnp.asarray(x), 0, 1) for x in arrays))
+    clip = Clip(jnp.moveaxis(clip.q, -1, 0), jnp.moveaxis(clip.t, -1, 0), clip.valid)
     shortest, longest = 7, 48
     count = clip.valid.size * (longest - shortest + 1)
     reward = Reward(

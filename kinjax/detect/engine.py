@@ -20,7 +20,7 @@ from ..rotations import cross, normalize, rotate
 from . import noise
 from .displacements import Displacement, displacements, mean_pose, spikes
 from .instantaneous import LINE, NONE, POINT, SPACE, instantaneous
-from .interface import Clip, Found, Joints, Numbers, Plan, TemplateSpans
+from .interface import Clip, Found, Joints, Numbers, Plan, TemplateSpans, World
 from .merging import Elements, Spans, absorb_short_rests, elements, merge, runs
 from .noise import Pattern
 from .pivots import merged_pivots, template_noise
@@ -249,9 +249,12 @@ def _refit(plan: Plan, numbers: Numbers, spans: Spans, clip: Clip) -> tuple[Arra
 
 
 @partial(jax.jit, static_argnames="plan")
-def run_poses(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, given: tuple[Pattern, ...]) -> Found:
+def run_poses(
+    plan: Plan, numbers: Numbers, world: World, templates: TemplateSpans, given: tuple[Pattern, ...]
+) -> Found:
     """Detection from world poses."""
-    return run(plan, numbers, clip, templates, given)
+    clip = Clip(jnp.moveaxis(world.rotation, -1, 0), jnp.moveaxis(world.position, -1, 0), world.valid)
+    return run(plan, numbers, Clip(*(jnp.swapaxes(x, -1, -2) for x in clip)), templates, given)
 
 
 @partial(jax.jit, static_argnames="plan")

@@ -18,7 +18,7 @@ from ..errors import OptionError, ShapeError, find_name
 from ..kinematics import object_poses
 from ..motion import Motion, Poses
 from ..numerics import BLOCK, bucket
-from .interface import Clip, Joints
+from .interface import Joints, World
 from .settings import Settings
 
 
@@ -27,7 +27,7 @@ class Prepared:
     """One clip, ready to run: what the engine takes (NumPy arrays), `valid` (objects, frames) without padding, and the
     `origin` (objects, 3) to be added to the positions that come out."""
 
-    arrays: Clip | Joints
+    arrays: World | Joints
     valid: np.ndarray
     origin: np.ndarray
     lanes: int
@@ -130,14 +130,16 @@ def prepared(
     t = np.asarray(poses.position, float)
     first = np.argmax(valid, axis=1)
     origin = np.where(valid.any(1)[:, None] & near, t[first, np.arange(poses.objects)], 0.0)
-    seen = valid.T[..., None]
-    q = np.where(seen, np.asarray(poses.rotation), [1, 0, 0, 0]).transpose(2, 1, 0)
-    clip = padded_clip(q, np.where(seen, t - origin, 0.0).transpose(2, 1, 0), valid)
+    rotation, position = np.asarray(poses.rotation), t - origin
+    if not valid.all():
+        seen = valid.T[..., None]
+        rotation, position = np.where(seen, rotation, [1, 0, 0, 0]), np.where(seen, position, 0.0)
+    world = padded_world(rotation, position, valid.T)
     return Prepared(
-        clip,
+        world,
         valid,
         origin,
-        clip.q.shape[1],
+        world.valid.shape[1],
         poses.names,
         poses.frames,
         float(poses.rate),
@@ -153,17 +155,17 @@ def check_rate(rate: float) -> None:
         raise OptionError(f"rate is {rate}: it must be a positive number of frames a second")
 
 
-def padded_clip(q: np.ndarray, t: np.ndarray, valid: np.ndarray) -> Clip:
-    """Components-first poses (4 and 3, objects, frames) in the working precision, padded with unseen identity poses."""
-    objects, frames = valid.shape
+def padded_world(rotation: np.ndarray, position: np.ndarray, valid: np.ndarray) -> World:
+    """Poses (frames, objects, ...) in the working precision, padded with unseen identity poses."""
+    frames, objects = valid.shape
     lanes, length, dtype = 1 << (objects - 1).bit_length(), bucket(frames + BLOCK), working_dtype()
     out: tuple[Any, ...] = tuple(
-        np.zeros((*n, lanes, length), k) for n, k in (((4,), dtype), ((3,), dtype), ((), np.bool_))
+        np.zeros((length, lanes, *n), k) for n, k in (((4,), dtype), ((3,), dtype), ((), np.bool_))
     )
-    out[0][0] = 1
-    for whole, part in zip(out, (q, t, valid), strict=True):
-        whole[..., :objects, :frames] = part
-    return Clip(*out)
+    for whole, part in zip(out, (rotation, position, valid), strict=True):
+        whole[:frames, :objects] = part
+    out[0][frames:, :, 0] = out[0][:, objects:, 0] = 1
+    return World(*out)
 
 
 def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool) -> Prepared:
