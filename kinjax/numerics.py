@@ -74,21 +74,43 @@ def order_statistic(
     return jnp.where(enough, value, jnp.full_like(value, jnp.nan))
 
 
-def running_sum(x: Float[Array, "... n"]) -> Float[Array, "... n"]:
-    """Inclusive running sum along the last axis, by blocks: a product with a triangle of ones inside them, a short
-    scan over them (XLA's own cumulative sum takes a pass for every power of two)."""
-    n, block = x.shape[-1], BLOCK
-    whole = x if n % block == 0 else jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, -n % block)])
-    blocks = whole.reshape(*x.shape[:-1], -1, block)
-    inside = jnp.matmul(blocks, jnp.triu(jnp.ones((block, block), x.dtype)), precision="highest")
+def _blocks(x: Float[Array, "... n"]) -> tuple[Float[Array, "... blocks size"], Float[Array, "... blocks"]]:
+    """Inclusive running sums inside blocks, and the sum before each block: a product with a triangle of ones, and a short
+    scan over blocks (XLA's own cumulative sum takes a pass for every power of two)."""
+    n = x.shape[-1]
+    whole = x if n % BLOCK == 0 else jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, -n % BLOCK)])
+    blocks = whole.reshape(*x.shape[:-1], -1, BLOCK)
+    inside = jnp.matmul(blocks, jnp.triu(jnp.ones((BLOCK, BLOCK), x.dtype)), precision="highest")
     total = inside[..., -1]
-    before = jnp.cumsum(total, axis=-1) - total
-    return (inside + before[..., None]).reshape(*x.shape[:-1], -1)[..., :n]
+    return inside, jnp.cumsum(total, axis=-1) - total
+
+
+def running_sum(x: Float[Array, "... n"]) -> Float[Array, "... n"]:
+    """Inclusive running sum along the last axis."""
+    inside, before = _blocks(x)
+    return (inside + before[..., None]).reshape(*x.shape[:-1], -1)[..., : x.shape[-1]]
 
 
 def running_count(flags: Bool[Array, "... n"]) -> Int[Array, "... n"]:
     """Inclusive running count along the last axis; exact up to 2^24."""
     return running_sum(flags.astype(jnp.float32)).astype(jnp.int32)
+
+
+def true_positions(flags: Bool[Array, "lanes n"], most: int) -> tuple[Int[Array, "lanes most"], Int[Array, " lanes"]]:
+    """Indices of the first `most` true flags of each lane (`n` or more where there are fewer), and how many there are.
+
+    By rank: the block is looked up, then the place in it, so no running count of full length is written.
+    """
+    inside, before = _blocks(flags.astype(jnp.float32))
+    rank = jnp.arange(1, most + 1, dtype=jnp.float32)
+    until = before + inside[..., -1]
+    block = jax.vmap(lambda u: jnp.searchsorted(u, rank).astype(jnp.int32))(until)
+    found = jnp.minimum(block, until.shape[-1] - 1)
+    row = jnp.take_along_axis(inside, found[..., None], axis=1)
+    left = rank - jnp.take_along_axis(before, found, axis=1)
+    place = found * jnp.asarray(BLOCK, jnp.int32) + jnp.sum(row < left[..., None], axis=-1, dtype=jnp.int32)
+    total = until[..., -1].astype(jnp.int32)
+    return jnp.where(rank.astype(jnp.int32) <= total[:, None], place, flags.shape[-1]), total
 
 
 def bucket(n: int, smallest: int = 64) -> int:

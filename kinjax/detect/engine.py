@@ -254,7 +254,8 @@ def run_poses(
 ) -> Found:
     """Detection from world poses."""
     clip = Clip(jnp.moveaxis(world.rotation, -1, 0), jnp.moveaxis(world.position, -1, 0), world.valid)
-    return run(plan, numbers, Clip(*(jnp.swapaxes(x, -1, -2) for x in clip)), templates, given)
+    clip = Clip(*jax.lax.optimization_barrier(tuple(jnp.swapaxes(x, -1, -2) for x in clip)))
+    return run(plan, numbers, clip, templates, given)
 
 
 @partial(jax.jit, static_argnames="plan")

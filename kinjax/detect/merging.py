@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..numerics import running_count, safe_divide, safe_norm
+from ..numerics import running_count, safe_divide, safe_norm, true_positions
 from ..rotations import cross, dot
 from .instantaneous import LINE, NONE, POINT, SPACE
 
@@ -110,15 +110,13 @@ def elements(
     start, stop: where a displacement's constraint lies at its begin and at its end.
     """
     n = kind.shape[-1]
-    begins, ends = running_count(bounds[0]), running_count(bounds[1])
-    rank = jnp.arange(1, capacity + 1, dtype=jnp.int32)
-    find = jax.vmap(lambda c: jnp.searchsorted(c, rank, method="scan_unrolled"))
-    first, last = find(begins), find(ends)
-    total = begins[:, -1]
-    real = rank <= total[:, None]
+    # materialised first: fused into the blocks of a running count, what makes the flags would not be vectorised
+    begins, ends, failed, lost = jax.lax.optimization_barrier((*bounds, counted & (kind == NONE), missing))
+    first, total = true_positions(begins, capacity)
+    last, _ = true_positions(ends, capacity)
+    fails, gone = running_count(failed), running_count(lost)
+    real = first < n
     i, j = jnp.minimum(first, n - 1), jnp.minimum(last, n - 1)
-    fails = running_count(counted & (kind == NONE))
-    gone = running_count(missing)
 
     def take(x: Array, at: Array) -> Array:
         return jnp.take_along_axis(x, at, axis=-1)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -45,8 +46,8 @@ def widths(settings: Settings, rate: float) -> dict[str, int | tuple[int, int]]:
 def numbers(settings: Settings, rate: float, pivot_noise: np.ndarray) -> Numbers:
     """Settings that are data, as arrays; `pivot_noise` (lanes,) in metres by object."""
     dtype = working_dtype()
-    f = lambda x: jnp.asarray(x, dtype)  # noqa: E731
-    count = lambda s, least=0: jnp.asarray(max(least, int(np.floor(s * rate + 0.5))), jnp.int32)  # noqa: E731
+    f: Any = lambda x: np.asarray(x, dtype)  # noqa: E731  (NumPy: eighteen small transfers cost more than they hold)
+    count: Any = lambda s, least=0: np.asarray(max(least, int(np.floor(s * rate + 0.5))), np.int32)  # noqa: E731
     low = (settings.thresholds or (0.0, 0.0)) if settings.method == "paper" else (settings.still[1], settings.still[0])
     return Numbers(
         f(rate),
