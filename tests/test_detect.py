@@ -103,7 +103,7 @@ def test_a_second_clip_of_the_same_bucket_compiles_nothing(foot, walk, compilati
     detect(walk.motion.slice(0, 350), FEET)
     assert compilations  # the listener hears
     compilations.clear()
-    detect(foot.poses.slice(0, 340))
+    detect(foot.poses.slice(0, 360))
     detect(foot.poses.slice(20, 380), still=(0.2, 2.0), min_duration=0.1, max_gap=0.05)
     detect(walk.motion.slice(20, 360), ["RightFoot", "LeftFoot"])
     assert not compilations
@@ -247,3 +247,21 @@ def test_line_templates_teach_the_noise_of_pivots(foot):
 def test_a_template_of_a_type_that_is_not_asked_for_is_an_error(foot):
     with pytest.raises(TemplateError, match="asked for"):
         detect(foot.poses, templates=[Template("foot", 92, 114, "line")])
+
+
+def test_window_rewards_do_not_depend_on_how_many_lanes_there_are():
+    """A body at rest earns the same alone and among many (a compiler's reduction once made it depend on the size)."""
+    import jax.numpy as jnp
+
+    from kinjax.detect.windows import Reward, window_rewards
+
+    def rewards(lanes, frames):
+        q = jnp.zeros((4, lanes, frames), jnp.float32).at[0].set(1)
+        t, seen = jnp.zeros((3, lanes, frames), jnp.float32), jnp.ones((lanes, frames), bool)
+        reward = Reward(*(jnp.float32(x) for x in (4.0, 0.003, 28.0, 0.2, 1e-4)))
+        reward = reward._replace(nu=jnp.full(lanes, 0.003, jnp.float32))
+        return jax.jit(lambda q, t, v: window_rewards(q, t, v, ~v, 6, 12, reward, rest=False))(q, t, seen)
+
+    few, many = np.asarray(rewards(2, 320)), np.asarray(rewards(40, 320))
+    np.testing.assert_allclose(few[-1, :, 20], 12 * 4.0 - 28.0, rtol=1e-5)
+    np.testing.assert_array_equal(many, np.broadcast_to(few[:, :1], many.shape))

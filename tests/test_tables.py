@@ -12,7 +12,7 @@ from benchmarks.tables import costs, scores
 from benchmarks.tables.__main__ import main, table
 from benchmarks.tables.labels import CASES, Labels, Span, Target, read_clip, read_labels
 from kinjax.annotations import Constraint, Constraints
-from kinjax.detect import Settings, pipeline
+from kinjax.detect import Settings
 from kinjax.errors import KinjaxError
 from kinjax.kinematics import forward_kinematics, object_poses
 
@@ -82,8 +82,7 @@ def test_walk_any_labelled_plant_finds_all_plants(data: Path):
             assert s.sure <= 2  # all but two frames of it are where the labeller was not sure either
 
 
-def test_ladder_feet_are_found_with_one_template_each(data: Path, monkeypatch):
-    monkeypatch.setattr(pipeline, "CAPACITY", 256, raising=False)  # room from the beginning: one compilation less
+def test_ladder_feet_are_found_with_one_template_each(data: Path):
     motion, labels = clip_of(data, "01_03"), LABELS["01_03"]
     targets = [t for e in ("lfoot", "rfoot") for t in labels.targets(e)]
     one = [replace(t, spans=(max(t.spans, key=lambda s: s.frames),)) for t in targets]

@@ -221,7 +221,9 @@ def _rest_windows(
         spread = jax.vmap(
             lambda q, t, v, s: noise.template_spread(q, t, v, s, plan.template_frames), in_axes=(1, 1, 0, 0)
         )
-        noise_level = jnp.maximum(noise_level, spread(*clip, templates[0]))
+        # a template that creeps must not pass for noise: no more than twice the least, as the robust method's cap
+        taught = jnp.minimum(spread(*clip, templates[0]), numbers.pivot_noise + numbers.pivot_noise)
+        noise_level = jnp.maximum(noise_level, taught)
     reward = Reward(beta, noise_level, beta * jnp.asarray(0.06, dtype) * numbers.rate, numbers.pivot_reach, beta * 0)
     nothing = jnp.zeros_like(clip.valid)
     windows = best_segmentation(window_rewards(*clip, nothing, *plan.rest, reward, rest=True), plan.rest[0])

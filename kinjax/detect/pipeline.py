@@ -20,7 +20,7 @@ from ..motion import Motion, Poses
 from ..numerics import BLOCK, bucket
 from .engine import joint_poses, run_joints, run_poses
 from .interface import Found, Joints, Plan, World
-from .planning import CAPACITY, LINE_CAPACITY, given_patterns, numbers, pivot_patterns, plan_of, template_spans
+from .planning import capacity_of, given_patterns, numbers, pivot_patterns, plan_of, template_spans
 from .prepare import Prepared, padded_world, prepared
 from .records import detection, kinds_of, pattern_records, unit_of
 from .results import Detection
@@ -114,9 +114,8 @@ def _run(
     """Plan and run the engine; with more capacity if needed."""
     if templates and patterns:
         raise OptionError("give templates or patterns, not both; calibrate with all templates to refine a pattern")
-    plan = plan_of(settings, clip.rate, 0, 0, bool(patterns), CAPACITY)
-    if plan.lines and settings.method == "paper":
-        plan = replace(plan, capacity=LINE_CAPACITY)
+    plan = plan_of(settings, clip.rate, 0, 0, bool(patterns), 0)
+    plan = replace(plan, capacity=capacity_of(clip.frames, plan.lines and settings.method == "paper"))
     kinds = kinds_of(plan)
     if settings.method == "paper" and not (templates or patterns or settings.thresholds):
         raise OptionError(

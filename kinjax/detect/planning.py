@@ -22,10 +22,13 @@ from .noise import Pattern, Spans
 from .prepare import Prepared, working_dtype
 from .settings import Settings
 
-CAPACITY = 64
-"""Elements that the merging scan holds at first; a clip with more is run again with enough."""
-LINE_CAPACITY = 512
-"""The same where every line displacement is an element (the paper's method)."""
+
+def capacity_of(frames: int, every_line: bool) -> int:
+    """Elements that the merging scan holds at first; a clip with more is run again with enough.
+
+    every_line: each line displacement is an element of its own (the paper's method).
+    """
+    return 512 if every_line else 64 if frames <= 1024 else 256
 
 
 def widths(settings: Settings, rate: float) -> dict[str, int | tuple[int, int]]:
