@@ -104,13 +104,21 @@ def true_positions(flags: Bool[Array, "lanes n"], most: int) -> tuple[Int[Array,
     inside, before = _blocks(flags.astype(jnp.float32))
     rank = jnp.arange(1, most + 1, dtype=jnp.float32)
     until = before + inside[..., -1]
-    block = jax.vmap(lambda u: jnp.searchsorted(u, rank).astype(jnp.int32))(until)
+    block = jnp.sum(until[:, None, :] < rank[:, None], axis=-1, dtype=jnp.int32)
     found = jnp.minimum(block, until.shape[-1] - 1)
     row = jnp.take_along_axis(inside, found[..., None], axis=1)
     left = rank - jnp.take_along_axis(before, found, axis=1)
     place = found * jnp.asarray(BLOCK, jnp.int32) + jnp.sum(row < left[..., None], axis=-1, dtype=jnp.int32)
     total = until[..., -1].astype(jnp.int32)
     return jnp.where(rank.astype(jnp.int32) <= total[:, None], place, flags.shape[-1]), total
+
+
+def counts_at(flags: Bool[Array, "lanes n"], index: Int[Array, "lanes k"]) -> Int[Array, "lanes k"]:
+    """Inclusive running count of flags at some indices only."""
+    inside, before = _blocks(flags.astype(jnp.float32))
+    flat = inside.reshape(*inside.shape[:-2], -1)
+    at = jnp.take_along_axis(flat, index, axis=-1) + jnp.take_along_axis(before, index // BLOCK, axis=-1)
+    return at.astype(jnp.int32)
 
 
 def bucket(n: int, smallest: int = 64) -> int:

@@ -265,3 +265,11 @@ def test_window_rewards_do_not_depend_on_how_many_lanes_there_are():
     few, many = np.asarray(rewards(2, 320)), np.asarray(rewards(40, 320))
     np.testing.assert_allclose(few[-1, :, 20], 12 * 4.0 - 28.0, rtol=1e-5)
     np.testing.assert_array_equal(many, np.broadcast_to(few[:, :1], many.shape))
+
+
+@pytest.mark.parametrize("method", ["robust", "window"])
+def test_float64_gives_the_same_constraints(foot, method):
+    single = detect(foot.poses, method=method)
+    with jax.enable_x64(True):
+        double = detect(foot.poses, method=method)
+    assert double.sigma_3.dtype == np.float64 and spans(single) == spans(double)

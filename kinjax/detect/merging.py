@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..numerics import running_count, safe_divide, safe_norm, true_positions
+from ..numerics import counts_at, safe_divide, safe_norm, true_positions
 from ..rotations import cross, dot
 from .instantaneous import LINE, NONE, POINT, SPACE
 
@@ -114,7 +114,6 @@ def elements(
     begins, ends, failed, lost = jax.lax.optimization_barrier((*bounds, counted & (kind == NONE), missing))
     first, total = true_positions(begins, capacity)
     last, _ = true_positions(ends, capacity)
-    fails, gone = running_count(failed), running_count(lost)
     real = first < n
     i, j = jnp.minimum(first, n - 1), jnp.minimum(last, n - 1)
 
@@ -132,8 +131,8 @@ def elements(
         lanes(take3(start, i)),
         lanes(take3(stop, j)),
         lanes(take3(axis, i) if axis is not None else jnp.zeros((3, *i.shape), start.dtype)),
-        lanes(jnp.stack([take(fails, i), take(fails, j)])),
-        lanes(jnp.stack([take(gone, i), take(gone, j)])),
+        lanes(jnp.stack([counts_at(failed, i), counts_at(failed, j)])),
+        lanes(jnp.stack([counts_at(lost, i), counts_at(lost, j)])),
         total,
     )
 
@@ -198,11 +197,42 @@ def merge(items: Elements, tolerance: Tolerance, lines: bool) -> Spans:
         jnp.moveaxis(items.gone, 1, 0),
     )
     start = (jnp.full_like(zero, NONE), zero, zero, zero3, zero3, zero, zero)
-    state, out = jax.lax.scan(step, start, xs)
+    state, out = scan_as_far(step, start, xs, jnp.max(items.total, initial=0))
     return packed(Spans(*(jnp.concatenate([o, s[None]]) for o, s in zip(out, state[:3], strict=True))))
 
 
+CHUNK = 32
+"""Steps that `scan_as_far` takes at once."""
+
+
+def scan_as_far(step: Any, start: Any, xs: Any, count: Int[Array, ""]) -> tuple[Any, Any]:
+    """`jax.lax.scan` over the first `count` elements (rounded up to a chunk): room for many costs nothing where there are few.
+
+    What lies beyond is not visited; its outputs are 0.
+    """
+    capacity = jax.tree.leaves(xs)[0].shape[0]
+    if capacity % CHUNK:
+        return jax.lax.scan(step, start, xs)
+    chunks = jax.tree.map(lambda x: x.reshape(-1, CHUNK, *x.shape[1:]), xs)
+    one = jax.tree.map(lambda x: x[0], chunks)
+    like = jax.eval_shape(lambda s, x: jax.lax.scan(step, s, x)[1], start, one)
+    out = jax.tree.map(lambda y: jnp.zeros((capacity // CHUNK, *y.shape), y.dtype), like)
+
+    def chunk(i: Int[Array, ""], carried: Any) -> Any:
+        state, out = carried
+        here = jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, i, 0, keepdims=False), chunks)
+        state, new = jax.lax.scan(step, state, here)
+        return state, jax.tree.map(lambda o, n: jax.lax.dynamic_update_index_in_dim(o, n, i, 0), out, new)
+
+    needed = jnp.minimum((count + CHUNK - 1) // CHUNK, capacity // CHUNK)
+    state, out = jax.lax.fori_loop(0, needed, chunk, (start, out))
+    return state, jax.tree.map(lambda y: y.reshape(capacity, *y.shape[2:]), out)
+
+
 def packed(spans: Spans) -> Spans:
-    """Empty slots last, order kept; the last slot of a scan over C elements stays free for none."""
-    order = jnp.argsort(spans.kind == NONE, axis=0, stable=True)
-    return Spans(*(jnp.take_along_axis(x, order, axis=0) for x in spans))
+    """Empty slots last, order kept."""
+    slots = spans.kind.shape[0]
+    at, total = true_positions(spans.kind.T != NONE, slots)
+    at = jnp.minimum(at, slots - 1).T
+    kind, first, last = (jnp.take_along_axis(x, at, axis=0) for x in spans)
+    return Spans(jnp.where(jnp.arange(slots, dtype=jnp.int32)[:, None] < total, kind, NONE), first, last)

@@ -58,6 +58,7 @@ def settle(
         turned = 2 * safe_norm(multiply(at(raw.q, index), conjugate(at(mean.q, place)))[1:], axis=0)
         wide = lambda nu, allowed: (allowed + 2.5 * nu)[:, None, None]  # noqa: E731
         same = (safe_norm(apart, axis=0) <= wide(noise[0], PLACE)) & (turned <= wide(noise[1], PLACE / 0.1))
-        return jnp.sum(jnp.cumprod(same & inside & at(raw.valid, index), axis=-1, dtype=edge.dtype), axis=-1).T
+        grown = jnp.cumprod(same & inside & at(raw.valid, index), axis=-1, dtype=edge.dtype)
+        return jnp.sum(grown, axis=-1, dtype=edge.dtype).T
 
     return Spans(spans.kind, spans.first - frames_more(spans.first, -1), spans.last + frames_more(spans.last, 1))
