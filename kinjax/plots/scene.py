@@ -52,7 +52,8 @@ def skeleton_3d(
 
     body: a `Motion`, or (names, parents, positions (F, J, 3) in metres). constraints: a `Detection`, `Annotations` or
     constraints: space is a box with a cross and its object's name, a line lies along its axis, a point is a dot.
-    frame: one frame, several as a strip, or `None` for four spread over the clip. trail: joints whose path is drawn.
+    frame: one frame, several as a strip, or `None` for up to four in
+    the middle of constraints, spread over the clip. trail: joints whose path is drawn.
     up: "x", "y" or "z", by default the skeleton's own, "y" without one. ax: axes of `projection="3d"`, one a frame.
     """
     if isinstance(body, Motion):
@@ -120,15 +121,23 @@ def _rate(source: Source) -> float:
     return next((c.fps for c in style.constraints_of(source) if c.fps), 0.0)
 
 
+def _telling_frames(constraints: Sequence[tuple[Constraint, float]], count: int) -> list[int]:
+    """Four frames spread over the clip, each moved to the middle of the nearest constraint (times its frames' scale)."""
+    spread = np.linspace(0, count - 1, min(count, 6))[1:-1].astype(int).tolist() if count > 2 else [0]
+    middles = sorted({int((c.begin + c.end) / 2 * scale) for c, scale in constraints})
+    middles = [m for m in middles if 0 <= m < count]
+    chosen = {min(middles, key=lambda m: abs(m - f)) if middles else f for f in spread}
+    return sorted(chosen)
+
+
 def _draw(stage: Stage, source: Source, frame: int | Sequence[int] | None, ax: Axes | Sequence[Axes] | None) -> Figure:
     """A panel a frame, all to one scale and seen from one side."""
     constraints, count = style.constraints_of(source), len(stage.position)
     if frame is None:
-        frame = np.linspace(0, count - 1, min(count, 6))[1:-1].astype(int).tolist() if count > 2 else [0]
+        frame = _telling_frames([(c, (stage.rate or c.fps) / (c.fps or stage.rate or 1)) for c in constraints], count)
     frames = [int(f) for f in np.atleast_1d(np.asarray(frame))]
     if any(not 0 <= f < count for f in frames) or not frames:
         raise OptionError(f"frames {frames} are not inside the clip's 0..{count - 1}")
-    whole = stage.boxes is not None or len(frames) == 1
     whole = stage.boxes is not None or len(frames) == 1
     boxes, azimuth = _views(stage, constraints, frames, whole), glyphs.side_view(stage.position)
     own = ax is None
