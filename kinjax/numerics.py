@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+Bits = UInt32[Array, "lanes words"]
+"""Flags packed 32 to a word."""
 
 BLOCK = 32
 """Running sums work in blocks of so many; padded lengths are multiples of it (XLA pads slowly)."""
@@ -96,29 +99,60 @@ def running_count(flags: Bool[Array, "... n"]) -> Int[Array, "... n"]:
     return running_sum(flags.astype(jnp.float32)).astype(jnp.int32)
 
 
-def true_positions(flags: Bool[Array, "lanes n"], most: int) -> tuple[Int[Array, "lanes most"], Int[Array, " lanes"]]:
-    """Indices of the first `most` true flags of each lane (`n` or more where there are fewer), and how many there are.
+def packed_bits(flags: Bool[Array, "lanes n"]) -> Bits:
+    """32 flags a word, the first in the lowest bit: what looks at runs of flags then reads a thirty-second of the memory.
 
-    By rank: the block is looked up, then the place in it, so no running count of full length is written.
+    Two products with powers of two (exact in float32) pack them; missing flags at the end are False.
     """
-    inside, before = _blocks(flags.astype(jnp.float32))
-    rank = jnp.arange(1, most + 1, dtype=jnp.float32)
-    until = before + inside[..., -1]
+    n = flags.shape[-1]
+    whole = flags if n % 32 == 0 else jnp.pad(flags, [(0, 0), (0, -n % 32)])
+    powers = jnp.asarray([2.0**k for k in range(16)], jnp.float32)
+    halves = jnp.matmul(whole.reshape(flags.shape[0], -1, 2, 16).astype(jnp.float32), powers, precision="highest")
+    low, high = halves[..., 0].astype(jnp.uint32), halves[..., 1].astype(jnp.uint32)
+    return low | (high << jnp.uint32(16))
+
+
+def bits_before(words: Bits) -> Bits:
+    """Each flag's predecessor (False before the first)."""
+    above = jnp.concatenate([jnp.zeros_like(words[:, :1]), words[:, :-1]], axis=1)
+    return (words << jnp.uint32(1)) | (above >> jnp.uint32(31))
+
+
+def bits_after(words: Bits) -> Bits:
+    """Each flag's successor (False after the last)."""
+    below = jnp.concatenate([words[:, 1:], jnp.zeros_like(words[:, :1])], axis=1)
+    return (words >> jnp.uint32(1)) | (below << jnp.uint32(31))
+
+
+def _counts(words: Bits) -> tuple[Int[Array, "lanes words"], Int[Array, "lanes words"]]:
+    """Flags up to each word's end, and before its begin."""
+    own = jax.lax.population_count(words).astype(jnp.int32)
+    until = jnp.cumsum(own, axis=-1, dtype=jnp.int32)
+    return until, until - own
+
+
+def true_positions(words: Bits, most: int) -> tuple[Int[Array, "lanes most"], Int[Array, " lanes"]]:
+    """Indices of the first `most` true flags of each lane (beyond the last word where there are fewer), and their number."""
+    until, before = _counts(words)
+    rank = jnp.arange(1, most + 1, dtype=jnp.int32)
     block = jnp.sum(until[:, None, :] < rank[:, None], axis=-1, dtype=jnp.int32)
-    found = jnp.minimum(block, until.shape[-1] - 1)
-    row = jnp.take_along_axis(inside, found[..., None], axis=1)
+    found = jnp.minimum(block, words.shape[-1] - 1)
     left = rank - jnp.take_along_axis(before, found, axis=1)
-    place = found * jnp.asarray(BLOCK, jnp.int32) + jnp.sum(row < left[..., None], axis=-1, dtype=jnp.int32)
-    total = until[..., -1].astype(jnp.int32)
-    return jnp.where(rank.astype(jnp.int32) <= total[:, None], place, flags.shape[-1]), total
+    word = jnp.take_along_axis(words, found, axis=1)
+    upto = (jnp.uint32(2) << jnp.arange(32, dtype=jnp.uint32)) - jnp.uint32(1)  # masks of the lowest 1, 2, ..., 32 bits
+    seen = jax.lax.population_count(word[..., None] & upto).astype(jnp.int32)
+    place = found * jnp.asarray(32, jnp.int32) + jnp.sum(seen < left[..., None], axis=-1, dtype=jnp.int32)
+    total = until[:, -1]
+    return jnp.where(rank <= total[:, None], place, jnp.asarray(32 * words.shape[-1], jnp.int32)), total
 
 
-def counts_at(flags: Bool[Array, "lanes n"], index: Int[Array, "lanes k"]) -> Int[Array, "lanes k"]:
-    """Inclusive running count of flags at some indices only."""
-    inside, before = _blocks(flags.astype(jnp.float32))
-    flat = inside.reshape(*inside.shape[:-2], -1)
-    at = jnp.take_along_axis(flat, index, axis=-1) + jnp.take_along_axis(before, index // BLOCK, axis=-1)
-    return at.astype(jnp.int32)
+def counts_at(words: Bits, index: Int[Array, "lanes k"]) -> Int[Array, "lanes k"]:
+    """How many flags are true up to each index, that one included."""
+    _, before = _counts(words)
+    block, bit = index // 32, (index % 32).astype(jnp.uint32)
+    upto = (jnp.uint32(2) << bit) - jnp.uint32(1)
+    own = jax.lax.population_count(jnp.take_along_axis(words, block, axis=1) & upto).astype(jnp.int32)
+    return jnp.take_along_axis(before, block, axis=1) + own
 
 
 def bucket(n: int, smallest: int = 64) -> int:

@@ -13,9 +13,13 @@ from hypothesis import strategies as st
 from benchmarks import reliability
 from kinjax.numerics import (
     BLOCK,
+    bits_after,
+    bits_before,
     bucket,
+    counts_at,
     eps_of,
     order_statistic,
+    packed_bits,
     running_count,
     running_sum,
     safe_divide,
@@ -285,3 +289,24 @@ def test_shape_annotations_hold_as_the_engine_runs():
     done = subprocess.run([sys.executable, "-c", HOOKED], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-4000:]
     assert done.stdout.split() == ["SEEN", "CHECKED"]
+
+
+@pytest.mark.parametrize("n", [32, 64, 77, 320])
+def test_packed_bits_find_and_count_flags(n):
+    rng = np.random.default_rng(n)
+    flags = rng.random((4, n)) < np.array([[0.0], [0.1], [0.6], [1.0]])
+    words = packed_bits(jnp.asarray(flags))
+    found, total = true_positions(words, n)
+    for lane in range(4):
+        at = np.flatnonzero(flags[lane])
+        assert total[lane] == len(at)
+        np.testing.assert_array_equal(found[lane][: len(at)], at)
+        assert (np.asarray(found[lane][len(at) :]) >= n).all()
+    index = rng.integers(0, n, (4, 50))
+    expected = np.take_along_axis(np.cumsum(flags, axis=1), index, axis=1)
+    np.testing.assert_array_equal(counts_at(words, jnp.asarray(index, jnp.int32)), expected)
+    earlier, later = np.zeros_like(flags), np.zeros_like(flags)
+    earlier[:, 1:], later[:, :-1] = flags[:, :-1], flags[:, 1:]
+    whole = n // 32  # the last word may hold one shifted flag more
+    for shifted, expected in ((bits_before(words), earlier), (bits_after(words), later)):
+        np.testing.assert_array_equal(shifted[:, :whole], packed_bits(jnp.asarray(expected))[:, :whole])

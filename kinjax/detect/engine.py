@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..kinematics import world_transforms
-from ..numerics import BLOCK
+from ..numerics import BLOCK, packed_bits
 from ..rotations import cross, normalize, rotate
 from . import noise
 from .displacements import Displacement, displacements, mean_pose, spikes
@@ -230,7 +230,14 @@ def _rest_windows(
     kind = jnp.where(windows.inside, SPACE, NONE)
     smooth = mean_pose(*clip, plan.mean)[1]
     items = elements(
-        kind, (windows.is_first, windows.is_last), clip.valid, ~clip.valid, smooth, smooth, None, plan.capacity
+        kind,
+        (packed_bits(windows.is_first), packed_bits(windows.is_last)),
+        clip.valid,
+        ~clip.valid,
+        smooth,
+        smooth,
+        None,
+        plan.capacity,
     )
     return items, merge(items, numbers.tolerance, False)
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..numerics import counts_at, safe_divide, safe_norm, true_positions
+from ..numerics import Bits, bits_after, bits_before, counts_at, packed_bits, safe_divide, safe_norm, true_positions
 from ..rotations import cross, dot
 from .instantaneous import LINE, NONE, POINT, SPACE
 
@@ -86,17 +86,15 @@ def absorb_short_rests(
     return jnp.where(absorbed, NONE, kind), absorbed
 
 
-def runs(kind: Int[Array, "objects n"]) -> tuple[Bool[Array, "objects n"], Bool[Array, "objects n"]]:
+def runs(kind: Int[Array, "objects n"]) -> tuple[Bits, Bits]:
     """Where elements begin and end: runs of consecutive space displacements, and every single line displacement."""
-    space, line = kind == SPACE, kind == LINE
-    before = jnp.concatenate([jnp.zeros_like(space[:, :1]), space[:, :-1]], -1)
-    after = jnp.concatenate([space[:, 1:], jnp.zeros_like(space[:, :1])], -1)
-    return (space & ~before) | line, (space & ~after) | line
+    space, line = packed_bits(kind == SPACE), packed_bits(kind == LINE)
+    return (space & ~bits_before(space)) | line, (space & ~bits_after(space)) | line
 
 
 def elements(
     kind: Int[Array, "objects n"],
-    bounds: tuple[Bool[Array, "objects n"], Bool[Array, "objects n"]],
+    bounds: tuple[Bits, Bits],
     counted: Bool[Array, "objects n"],
     missing: Bool[Array, "objects n"],
     start: Float[Array, "3 objects n"],
@@ -110,10 +108,9 @@ def elements(
     start, stop: where a displacement's constraint lies at its begin and at its end.
     """
     n = kind.shape[-1]
-    # materialised first: fused into the blocks of a running count, what makes the flags would not be vectorised
-    begins, ends, failed, lost = jax.lax.optimization_barrier((*bounds, counted & (kind == NONE), missing))
-    first, total = true_positions(begins, capacity)
-    last, _ = true_positions(ends, capacity)
+    first, total = true_positions(bounds[0], capacity)
+    last, _ = true_positions(bounds[1], capacity)
+    failed, lost = packed_bits(counted & (kind == NONE)), packed_bits(missing)
     real = first < n
     i, j = jnp.minimum(first, n - 1), jnp.minimum(last, n - 1)
 
@@ -232,7 +229,7 @@ def scan_as_far(step: Any, start: Any, xs: Any, count: Int[Array, ""]) -> tuple[
 def packed(spans: Spans) -> Spans:
     """Empty slots last, order kept."""
     slots = spans.kind.shape[0]
-    at, total = true_positions(spans.kind.T != NONE, slots)
+    at, total = true_positions(packed_bits(spans.kind.T != NONE), slots)
     at = jnp.minimum(at, slots - 1).T
     kind, first, last = (jnp.take_along_axis(x, at, axis=0) for x in spans)
     return Spans(jnp.where(jnp.arange(slots, dtype=jnp.int32)[:, None] < total, kind, NONE), first, last)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..numerics import safe_sqrt
+from ..numerics import packed_bits, safe_sqrt
 from ..rotations import dot
 from .instantaneous import LINE, NONE, POINT, SPACE
 from .merging import Spans, elements, packed
@@ -62,7 +62,16 @@ def merged_pivots(
     windows = best_segmentation(rewards, lengths[0])
     kind = jnp.where(windows.inside, LINE, NONE)
     nowhere = jnp.zeros_like(t)
-    items = elements(kind, (windows.is_first, windows.is_last), valid, ~valid, nowhere, nowhere, None, capacity)
+    items = elements(
+        kind,
+        (packed_bits(windows.is_first), packed_bits(windows.is_last)),
+        valid,
+        ~valid,
+        nowhere,
+        nowhere,
+        None,
+        capacity,
+    )
     spans = _merged(q, t, valid, items.kind != NONE, items.first, items.last, reward, rate)
     used = spans.kind != NONE
     moments, origin = span_moments(q, t, valid, spans.first, spans.last, used)
