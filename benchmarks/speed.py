@@ -13,11 +13,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-CORE = min(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
+CORE = max(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
 
 
 def one_core() -> None:
-    """Pin this process to one core, before anything starts threads."""
+    """Pin this process to one core (the last: the first serves the machine), before anything starts threads."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {CORE})
     os.environ.setdefault("OMP_NUM_THREADS", "1")

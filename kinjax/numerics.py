@@ -6,6 +6,8 @@ substituting *before* an operation and selecting *after* it, so that neither val
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
@@ -97,6 +99,12 @@ def running_sum(x: Float[Array, "... n"]) -> Float[Array, "... n"]:
 def running_count(flags: Bool[Array, "... n"]) -> Int[Array, "... n"]:
     """Inclusive running count along the last axis; exact up to 2^24."""
     return running_sum(flags.astype(jnp.float32)).astype(jnp.int32)
+
+
+def over_rows(f: Callable[[Array], Array], rows: Array) -> Array:
+    """`f` on every row of the first axis, `f` being one that broadcasts: all at once while they are small (fewer steps of a
+    loop), one by one when they are not (they stay in cache)."""
+    return f(rows) if rows.size <= 1 << 16 else jax.lax.map(f, rows)
 
 
 def packed_bits(flags: Bool[Array, "lanes n"]) -> Bits:

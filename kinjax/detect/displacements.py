@@ -13,10 +13,10 @@ from __future__ import annotations
 import functools
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..numerics import over_rows
 from ..rotations import conjugate, dot, matrix, multiply, normalize
 
 
@@ -107,8 +107,7 @@ def spikes(
         mad = median([jnp.where(w == big, big, jnp.abs(w - middle)) for w in window])
         return jnp.abs(x - middle) > jnp.maximum(jnp.asarray(4 * 1.4826, x.dtype) * mad, spike)
 
-    # one coordinate at a time keeps the windows in cache and the compiled loop small
-    found = jax.lax.map(outlying, coordinates)
+    found = over_rows(outlying, coordinates)
     return valid & jnp.any(found, axis=0)
 
 

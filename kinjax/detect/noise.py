@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..numerics import order_statistic, safe_divide, safe_sqrt
+from ..numerics import order_statistic, over_rows, safe_divide, safe_sqrt
 from ..rotations import matrix
 from ..splines import monotone_cubic, natural_cubic
 from .displacements import shifted
@@ -60,8 +60,8 @@ def data_noise(
         median = order_statistic(jnp.abs(third), four, jnp.maximum(rank, 0))
         return jnp.where(rank >= 0, (jnp.asarray(1.4826, x.dtype) * jnp.nan_to_num(median)) ** 2 / 20, 0)
 
-    nu_t = safe_sqrt(jnp.sum(jax.lax.map(variance, t), axis=0))
-    nu_r = safe_sqrt(jnp.sum(jax.lax.map(variance, matrix(q).reshape(9, *valid.shape)), axis=0) / 2)
+    nu_t = safe_sqrt(jnp.sum(over_rows(variance, t), axis=0))
+    nu_r = safe_sqrt(jnp.sum(over_rows(variance, matrix(q).reshape(9, *valid.shape)), axis=0) / 2)
     return nu_t, nu_r
 
 

@@ -129,7 +129,9 @@ def template_spans(
             if k == kind:
                 for i, (b, e) in enumerate(placed):
                     table[:, at, i] = b, e, 1
-        out.append(Spans(jnp.asarray(table[0]), jnp.asarray(table[1]), jnp.asarray(table[2] > 0)))
+        begin, end, used = table
+        arrays: Any = begin, end, used > 0
+        out.append(Spans(*arrays))
     return tuple(out), slots, bucket(longest)
 
 
