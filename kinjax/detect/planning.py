@@ -129,8 +129,7 @@ def template_spans(
             if k == kind:
                 for i, (b, e) in enumerate(placed):
                     table[:, at, i] = b, e, 1
-        begin, end, used = table
-        arrays: Any = begin, end, used > 0
+        arrays: Any = table[0], table[1], table[2] > 0
         out.append(Spans(*arrays))
     return tuple(out), slots, bucket(longest)
 
