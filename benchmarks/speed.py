@@ -111,7 +111,7 @@ def whole_detection() -> None:
 
     from benchmarks import numpy_baseline as nb
     from kinjax.detect import detect
-    from kinjax.kinematics import forward_kinematics
+    from kinjax.kinematics import forward_kinematics, object_poses
 
     motion = walking_crowd()
     thresholds = (2e-3, 2e-3)
@@ -143,6 +143,8 @@ def whole_detection() -> None:
     mine, theirs = in_turns(ours, projected, 4)
     whole = best(lambda: baseline(True, motion.joints), 1)
     loops = best(lambda: baseline(False, 3), 1) * motion.joints / 3
+    world = object_poses(motion)
+    alike = best(lambda: detect(world, method="paper", thresholds=thresholds), 10)
     robust = best(lambda: detect(motion), 5)
     size = "4,500 frames x 31 joints"
     row(
@@ -157,6 +159,12 @@ def whole_detection() -> None:
         f"{loops:.1f} s: x{loops / mine:.0f}",
         ">= 500",
         loops / mine >= 500,
+    )
+    row(
+        "  from world poses, as the baseline, against SVD part, loops",
+        f"{alike * 1e3:.1f} ms: x{theirs / alike:.0f}, x{loops / alike:.0f}",
+        "",
+        None,
     )
     row(
         "  the robust method on the same clip",
