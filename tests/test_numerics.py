@@ -174,7 +174,8 @@ def test_running_count_of_a_long_clip():
 @pytest.mark.parametrize("n", [1, 31, 64, 300])
 def test_true_positions(n):
     flags = np.random.default_rng(n).random((6, n)) < np.array([0, 0.02, 0.2, 0.5, 0.9, 1])[:, None]
-    found, total = jax.jit(true_positions, static_argnums=1)(jnp.asarray(flags), 40)
+    find = jax.jit(lambda f: true_positions(packed_bits(f), 40))
+    found, total = find(jnp.asarray(flags))
     np.testing.assert_array_equal(total, flags.sum(1))
     for row, f in zip(np.asarray(found), flags, strict=True):
         at = np.flatnonzero(f)[:40]

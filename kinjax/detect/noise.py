@@ -55,7 +55,7 @@ def data_noise(
     four = valid & shifted(valid, 1, False) & shifted(valid, 2, False) & shifted(valid, 3, False)
     rank = (jnp.sum(four, axis=-1, dtype=jnp.int32) - 1) // 2
 
-    def variance(x: Float[Array, "objects frames"]) -> Float[Array, " objects"]:
+    def variance(x: Float[Array, "*rows objects frames"]) -> Float[Array, "*rows objects"]:
         third = shifted(x, 3) - 3 * shifted(x, 2) + 3 * shifted(x, 1) - x
         median = order_statistic(jnp.abs(third), four, jnp.maximum(rank, 0))
         return jnp.where(rank >= 0, (jnp.asarray(1.4826, x.dtype) * jnp.nan_to_num(median)) ** 2 / 20, 0)
