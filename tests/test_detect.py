@@ -273,3 +273,9 @@ def test_float64_gives_the_same_constraints(foot, method):
     with jax.enable_x64(True):
         double = detect(foot.poses, method=method)
     assert double.sigma_3.dtype == np.float64 and spans(single) == spans(double)
+
+
+def test_window_refuses_patterns_that_it_would_not_use(walk):
+    pattern = calibrate(walk.motion, [Template("LeftFoot", *_stance(walk))])
+    with pytest.raises(OptionError, match="templates="):
+        detect(walk.motion, ["LeftFoot"], method="window", patterns=pattern)

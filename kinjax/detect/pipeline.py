@@ -114,6 +114,8 @@ def _run(
     """Plan and run the engine; with more capacity if needed."""
     if templates and patterns:
         raise OptionError("give templates or patterns, not both; calibrate with all templates to refine a pattern")
+    if settings.method == "window" and any(p.type == "space" for p in patterns):
+        raise OptionError('method="window" learns rest from templates, not from patterns: give templates=')
     plan = plan_of(settings, clip.rate, 0, 0, bool(patterns), 0)
     plan = replace(plan, capacity=capacity_of(clip.frames, plan.lines and settings.method == "paper"))
     kinds = kinds_of(plan)
