@@ -1,0 +1,155 @@
+"""The nonlinear solve of one frame: prioritized steps, tried, corrected, and accepted in lexicographic order.
+
+In: a start pose, the frame's goals and the input's pose. Out: the pose that serves the layers in order, and what it leaves.
+
+The linear guarantee does not survive the step (2004 paper, section 3.2, says nothing on it), so each iteration moves to
+several candidates at once: everything with the attraction to the input, and each prefix of the layers without it. Each is
+corrected once by the same factors, in the layers above its last: what the step's curvature did to them is undone. The
+candidate that is best in lexicographic order is kept, the pose as it is among them: no layer is ever worsened for a lower
+one by more than a slack.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ..numerics import safe_divide, safe_norm, safe_sqrt
+from ..rotations import conjugate, log, multiply, rotate
+from .chain import Chain, Pose, World, forward, moved, parent_rotations
+from .prioritized import factorize, layered_step, outside
+from .tasks import Goals, Seen, Tasks, jacobian, look, residuals
+
+
+class Solving(NamedTuple):
+    """Numbers of the solver (metres and radians): see `settings.Settings`."""
+
+    clamp: float = 0.1
+    budget: float = 1.0
+    damping: float = 0.3
+    damped_error: float = 0.05
+    slack: float = 1e-6
+    slack_ratio: float = 1e-4
+    tolerance: float = 1e-7
+
+
+class Reference(NamedTuple):
+    """What the pose is attracted to: the input's (4, P) rotations and (3,) root, and how strongly each joint is (0 or 1)."""
+
+    rotations: Float[Array, "4 p"]
+    root: Float[Array, " 3"]
+    attracted: Float[Array, " p"]
+    root_attracted: Float[Array, ""]
+
+
+class State(NamedTuple):
+    """One pose (trials C = 1) with everything that follows from it."""
+
+    pose: Pose
+    world: World
+    residual: Float[Array, "b 3"]
+    errors: Float[Array, " layers"]
+    iterations: Int[Array, ""]
+    done: Bool[Array, ""]
+    rank: Int[Array, " layers"]
+
+
+def solve_frame(
+    chain: Chain,
+    tasks: Tasks,
+    goals: Goals,
+    start: Pose,
+    offsets: Float[Array, "p 3"],
+    reference: Reference,
+    layers: int,
+    iterations: int,
+    solving: Solving,
+) -> State:
+    """Iterate from `start` until nothing is gained, `iterations` times at most."""
+    rows = jnp.repeat(tasks.layer, 3)
+    members = (rows[None, :] == jnp.arange(layers, dtype=jnp.int32)[:, None]).astype(offsets.dtype)  # (N, m)
+    block = jnp.kron(jnp.eye(tasks.kind.shape[0], dtype=offsets.dtype), jnp.ones((3, 3), offsets.dtype))
+
+    def evaluate(pose: Pose) -> tuple[World, Float[Array, "m c"], Float[Array, "n c"]]:
+        world = forward(chain, pose, offsets)
+        seen = look(tasks, world)
+        r = residuals(tasks, goals, seen)
+        r = r.reshape(-1, r.shape[-1])
+        return world, r, safe_sqrt(jnp.einsum("nm,mc->nc", members, r * r, precision="highest"))
+
+    def iterate(s: State) -> State:
+        seen = look(tasks, s.world)
+        r0 = s.residual.reshape(-1)
+        jac = jacobian(chain, tasks, goals, s.world, seen)
+        error = members.T @ s.errors
+        damping = solving.damping * jnp.minimum(1, error / solving.damped_error)
+        factors = factorize(jac, rows, damping)
+        y = layered_step(factors, r0, rows, layers, block, solving.clamp, solving.budget)
+        parent = parent_rotations(chain, s.world)
+        z = attraction(reference, s.pose, parent)
+        z = outside(factors.basis, z)
+        left = safe_sqrt(solving.budget**2 - y @ y)
+        z = z * jnp.minimum(1, safe_divide(left, safe_norm(z)))
+        # candidates: all with z, layers 0..N-1, 0..N-2, ..., 0
+        depth = jnp.concatenate([jnp.full((1,), layers, jnp.int32), jnp.arange(layers, 0, -1, dtype=jnp.int32)])
+        use = (rows[:, None] < depth[None, :]).astype(jac.dtype)
+        posture = (jnp.arange(layers + 1, dtype=jnp.int32) == 0).astype(jac.dtype)
+        step = factors.basis.rows.T @ (y[:, None] * use) + z[:, None] * posture[None, :]
+        trial = moved(chain, s.pose, parent, step)
+        _, r, _ = evaluate(trial)
+        # chord correction: what the step's curvature did to the layers above the last, undone with the same factors
+        expected = r0[:, None] - factors.basis.factors @ (y[:, None] * use)
+        depth2 = jnp.maximum(depth - 1, 1) + (posture > 0).astype(jnp.int32)
+        fix = jax.vmap(
+            lambda r: layered_step(factors, r, rows, layers, block, solving.clamp, solving.budget), in_axes=1, out_axes=1
+        )(r - expected)
+        use2 = (rows[:, None] < depth2[None, :]).astype(jac.dtype)
+        trial = moved(chain, s.pose, parent, step + factors.basis.rows.T @ (fix * use2))
+        world, r, errors = evaluate(trial)
+        everything = jnp.concatenate([errors, s.errors[:, None]], axis=1)
+        best = lexicographic(everything, solving)
+        stay = best == layers + 1
+        pick = jnp.minimum(best, layers)
+        take = lambda x, old: jnp.where(stay, old, jax.lax.dynamic_index_in_dim(x, pick, x.ndim - 1, keepdims=True))
+        kept = take(step, jnp.zeros_like(step[:, :1]))
+        done = stay | (jnp.max(jnp.abs(kept)) < solving.tolerance)
+        residual = jnp.where(stay, r0, jax.lax.dynamic_index_in_dim(r, pick, 1, keepdims=False))
+        return State(
+            Pose(take(trial.rotations, s.pose.rotations), take(trial.root, s.pose.root)),
+            take(world, s.world),
+            residual.reshape(-1, 3),
+            jnp.where(stay, s.errors, jax.lax.dynamic_index_in_dim(errors, pick, 1, keepdims=False)),
+            s.iterations + 1,
+            done,
+            (members @ (jnp.sum(factors.basis.rows**2, axis=1) > 0.5).astype(jac.dtype)).astype(jnp.int32),
+        )
+
+    world, r, errors = evaluate(start)
+    first = State(
+        start, world, r[:, 0].reshape(-1, 3), errors[:, 0], jnp.zeros((), jnp.int32), jnp.zeros((), bool), jnp.zeros(layers, jnp.int32)
+    )
+    return jax.lax.while_loop(lambda s: (s.iterations < iterations) & ~s.done, iterate, first)
+
+
+def attraction(reference: Reference, pose: Pose, parent: Float[Array, "4 p"]) -> Float[Array, " n"]:
+    """The optimization vector `z` of eq. 1: the step along world axes that would take the pose back to the input."""
+    q = pose.rotations[:, :, 0]
+    turn = rotate(parent, log(multiply(reference.rotations, conjugate(q)))) * reference.attracted
+    root = (reference.root - pose.root[:, 0]) * reference.root_attracted
+    return jnp.concatenate([root, turn.T.reshape(-1)])
+
+
+def lexicographic(errors: Float[Array, "layers c"], solving: Solving) -> Int[Array, ""]:
+    """The first candidate among those that no other beats: layer by layer, whoever is worse than the best by more than
+    `max(slack, slack_ratio * best)` is out."""
+
+    def narrow(i: Int[Array, ""], alive: Bool[Array, " c"]) -> Bool[Array, " c"]:
+        e = jax.lax.dynamic_index_in_dim(errors, i, 0, keepdims=False)
+        best = jnp.min(jnp.where(alive, e, jnp.inf))
+        return alive & (e <= best + jnp.maximum(solving.slack, solving.slack_ratio * best))
+
+    alive = jax.lax.fori_loop(0, errors.shape[0], narrow, jnp.isfinite(errors).all(0))
+    return jnp.argmax(alive).astype(jnp.int32)
