@@ -46,7 +46,13 @@ class Reference(NamedTuple):
 
 
 class State(NamedTuple):
-    """One pose (trials C = 1) with everything that follows from it."""
+    """One pose (trials C = 1) with everything that follows from it.
+
+    solo: (B,) how much of each constraint's residual its own recruited joints could still remove, as the cosine between it
+    and what they can do (0: out of reach). own: (N,) the same of each layer with what the layers above leave it (0: nothing
+    more to gain). rank: (N,) freedoms that each layer took. Those three are of the pose before the last step. stayed: no
+    candidate was better than the pose as it was.
+    """
 
     pose: Pose
     world: World
@@ -54,7 +60,10 @@ class State(NamedTuple):
     errors: Float[Array, " layers"]
     iterations: Int[Array, ""]
     done: Bool[Array, ""]
+    stayed: Bool[Array, ""]
     rank: Int[Array, " layers"]
+    solo: Float[Array, " b"]
+    own: Float[Array, " layers"]
 
 
 def solve_frame(
@@ -75,13 +84,13 @@ def solve_frame(
 
     def evaluate(pose: Pose) -> tuple[World, Float[Array, "m c"], Float[Array, "n c"]]:
         world = forward(chain, pose, offsets)
-        seen = look(tasks, world)
+        seen = look(tasks, goals, world)
         r = residuals(tasks, goals, seen)
         r = r.reshape(-1, r.shape[-1])
         return world, r, safe_sqrt(jnp.einsum("nm,mc->nc", members, r * r, precision="highest"))
 
     def iterate(s: State) -> State:
-        seen = look(tasks, s.world)
+        seen = look(tasks, goals, s.world)
         r0 = s.residual.reshape(-1)
         jac = jacobian(chain, tasks, goals, s.world, seen)
         error = members.T @ s.errors
@@ -117,6 +126,7 @@ def solve_frame(
         kept = take(step, jnp.zeros_like(step[:, :1]))
         done = stay | (jnp.max(jnp.abs(kept)) < solving.tolerance)
         residual = jnp.where(stay, r0, jax.lax.dynamic_index_in_dim(r, pick, 1, keepdims=False))
+        solo, own = _gains(factors.basis.factors, jac, r0, rows, members)
         return State(
             Pose(take(trial.rotations, s.pose.rotations), take(trial.root, s.pose.root)),
             take(world, s.world),
@@ -124,14 +134,45 @@ def solve_frame(
             jnp.where(stay, s.errors, jax.lax.dynamic_index_in_dim(errors, pick, 1, keepdims=False)),
             s.iterations + 1,
             done,
-            (members @ (jnp.sum(factors.basis.rows**2, axis=1) > 0.5).astype(jac.dtype)).astype(jnp.int32),
+            stay,
+            (members @ jnp.sum(factors.basis.rows**2, axis=1)).round().astype(jnp.int32),
+            solo,
+            own,
         )
 
     world, r, errors = evaluate(start)
+    b = tasks.kind.shape[0]
     first = State(
-        start, world, r[:, 0].reshape(-1, 3), errors[:, 0], jnp.zeros((), jnp.int32), jnp.zeros((), bool), jnp.zeros(layers, jnp.int32)
+        start,
+        world,
+        r[:, 0].reshape(-1, 3),
+        errors[:, 0],
+        jnp.zeros((), jnp.int32),
+        ~(jnp.any(goals.active > 0) & jnp.isfinite(errors).all()),
+        jnp.zeros((), bool),
+        jnp.zeros(layers, jnp.int32),
+        jnp.ones(b, offsets.dtype),
+        jnp.ones(layers, offsets.dtype),
     )
     return jax.lax.while_loop(lambda s: (s.iterations < iterations) & ~s.done, iterate, first)
+
+
+def _gains(
+    factors: Float[Array, "m m"],
+    jac: Float[Array, "m n"],
+    r: Float[Array, " m"],
+    rows: Int[Array, " m"],
+    members: Float[Array, "layers m"],
+) -> tuple[Float[Array, " b"], Float[Array, " layers"]]:
+    """`solo` and `own` of `State`, from the factors `J = R Q`: lengths of gradients `J' r` are lengths of `R' r`."""
+    size = jnp.sum(jac * jac, axis=1)
+    pull = (factors * r[:, None]).reshape(-1, 3, r.shape[0]).sum(1)  # (B, m): each constraint's R' r
+    whole = safe_sqrt(size.reshape(-1, 3).sum(1)) * safe_sqrt((r * r).reshape(-1, 3).sum(1))
+    solo = safe_divide(safe_sqrt((pull * pull).sum(1)), whole)
+    same = (rows[:, None] == rows[None, :]).astype(jac.dtype)
+    left = members @ (factors * same * r[:, None])  # (N, m): each layer's own R_ii' r
+    layer = safe_sqrt(members @ size) * safe_sqrt(members @ (r * r))
+    return solo, safe_divide(safe_sqrt((left * left).sum(1)), layer)
 
 
 def attraction(reference: Reference, pose: Pose, parent: Float[Array, "4 p"]) -> Float[Array, " n"]:

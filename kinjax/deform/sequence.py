@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .chain import Chain, Pose
 from .frame_solver import Reference, Solving, solve_frame
@@ -20,42 +20,66 @@ from .tasks import Goals, Tasks
 
 class Frames(NamedTuple):
     """F frames of input: local rotations (F, 4, P), root (F, 3), the joints' places in their parents' frames (F, P, 3), which
-    joints are controlled (F, P) and whether the root's place is (F,), as 0 or 1, and the goals."""
+    joints are controlled (F, P) and whether the root's place is (F,), as 0 or 1, whether the frame starts where the one
+    before it ended (F,) or, with 0, at the input, and the goals."""
 
     rotations: Float[Array, "f 4 p"]
     root: Float[Array, "f 3"]
     offsets: Float[Array, "f p 3"]
     controlled: Float[Array, "f p"]
     root_controlled: Float[Array, " f"]
+    warm: Float[Array, " f"]
     goals: Goals
 
 
 class Solved(NamedTuple):
-    """F frames of output."""
+    """F frames of output: poses, and what `State` says of each frame; sound is False where the solve was not finite and the
+    frame is the input's."""
 
     rotations: Float[Array, "f 4 p"]
     root: Float[Array, "f 3"]
-    residual: Float[Array, "f b 3"]
-    errors: Float[Array, "f layers"]
     iterations: Int[Array, " f"]
     rank: Int[Array, "f layers"]
+    solo: Float[Array, "f b"]
+    own: Float[Array, "f layers"]
+    stayed: Bool[Array, " f"]
+    sound: Bool[Array, " f"]
 
 
 def solve_sequence(
-    chain: Chain, tasks: Tasks, frames: Frames, first: Pose, layers: int, iterations: int, solving: Solving
-) -> Solved:
-    """All frames in their order, from the pose `first` (C = 1)."""
+    chain: Chain,
+    tasks: Tasks,
+    frames: Frames,
+    first: Pose,
+    solving: Solving,
+    layers: int,
+    iterations: int,
+    attract: tuple[bool, bool] = (True, True),
+) -> tuple[Pose, Solved]:
+    """All frames in their order, from the pose `first` (C = 1); gives the last pose, too.
 
-    def step(last: Pose, x: Frames):
+    attract: whether joints, and the root's translation, are drawn to the input. A frame whose solve is not finite restarts
+    from the input and is flagged; where the input itself is not finite, the next frame starts from the last sound one.
+    """
+
+    def step(last: Pose, x: Frames) -> tuple[Pose, Solved]:
         own = Pose(x.rotations[..., None], x.root[:, None])
-        held = x.controlled[None, :, None] > 0
         start = Pose(
-            jnp.where(held, last.rotations, own.rotations),
-            jnp.where(x.root_controlled > 0, last.root, own.root),
+            jnp.where((x.controlled * x.warm)[None, :, None] > 0, last.rotations, own.rotations),
+            jnp.where(x.root_controlled * x.warm * x.goals.root_free > 0, last.root, own.root),
         )
-        reference = Reference(x.rotations, x.root, x.controlled, x.root_controlled)
+        reference = Reference(x.rotations, x.root, attract[0] * x.controlled, attract[1] * x.root_controlled * x.goals.root_free)
         s = solve_frame(chain, tasks, x.goals, start, x.offsets, reference, layers, iterations, solving)
-        out = Solved(s.pose.rotations[..., 0], s.pose.root[:, 0], s.residual, s.errors, s.iterations, s.rank)
-        return s.pose, out
+        sound = jnp.isfinite(s.pose.rotations).all() & jnp.isfinite(s.pose.root).all() & jnp.isfinite(s.errors).all()
+        pose = Pose(
+            jnp.where(sound & (x.controlled[None, :, None] > 0), s.pose.rotations, own.rotations),
+            jnp.where(sound & (x.root_controlled * x.goals.root_free > 0), s.pose.root, own.root),
+        )
+        known = jnp.isfinite(pose.rotations).all() & jnp.isfinite(pose.root).all()
+        carried = Pose(jnp.where(known, pose.rotations, last.rotations), jnp.where(known, pose.root, last.root))
+        out = Solved(
+            pose.rotations[..., 0], pose.root[:, 0], s.iterations, s.rank, s.solo, s.own, s.stayed, sound
+        )  # fmt: skip
+        return carried, out
 
-    return jax.lax.scan(step, first, frames)[1]
+    return jax.lax.scan(step, first, frames)

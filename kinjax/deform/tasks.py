@@ -33,8 +33,8 @@ class Tasks(NamedTuple):
     joint's frame. look: unit vector in the joint's frame that a look-at turns to its target. scale: (B, 3) axes mask times
     the root of the weight. layer: (B,). recruits: (B, P) and root_recruited (B,): 1 where a joint may be used. above: (B, P)
     joints that move the point; beside: those that move its reference. centers: (D,) which constraints are on a centre of mass;
-    mass_joint (M,), mass_point (M, 3): where the mass points are; weights (D, M): theirs; carried (D, P, M): the same, of the
-    points that joint P moves.
+    mass_joint: (M,) the joints that carry the mass points; weights (D, M): theirs; carried (D, P, M): the same, of the points
+    that joint P moves.
     """
 
     kind: Int[Array, " b"]
@@ -50,17 +50,19 @@ class Tasks(NamedTuple):
     beside: Float[Array, "b p"]
     centers: Int[Array, " d"]
     mass_joint: Int[Array, " m"]
-    mass_point: Float[Array, "m 3"]
     weights: Float[Array, "d m"]
     carried: Float[Array, "d p m"]
 
 
 class Goals(NamedTuple):
-    """One frame's targets: place (B, 3), rotation (B, 4) and whether each constraint is active (B,), as 0 or 1."""
+    """One frame's targets: place (B, 3), rotation (B, 4) and whether each constraint is active (B,), as 0 or 1; mass_point
+    (M, 3): where the mass points are in their joints' frames; root_free: 0 where the root's translation is held."""
 
     place: Float[Array, "b 3"]
     rotation: Float[Array, "b 4"]
     active: Float[Array, " b"]
+    mass_point: Float[Array, "m 3"]
+    root_free: Float[Array, ""]
 
 
 class Seen(NamedTuple):
@@ -73,10 +75,10 @@ class Seen(NamedTuple):
     masses: Float[Array, "3 m c"]
 
 
-def look(tasks: Tasks, world: World) -> Seen:
+def look(tasks: Tasks, goals: Goals, world: World) -> Seen:
     """Points, rotations and reference frames of all constraints."""
     at, of = jnp.moveaxis(world[tasks.joint], 1, 0), jnp.moveaxis(world[tasks.reference], 1, 0)
-    masses = _place(jnp.moveaxis(world[tasks.mass_joint], 1, 0), tasks.mass_point)
+    masses = _place(jnp.moveaxis(world[tasks.mass_joint], 1, 0), goals.mass_point)
     point = _place(at, tasks.point)
     if tasks.centers.size:
         center = jnp.einsum("dm,imc->idc", tasks.weights, masses, precision="highest")
@@ -147,7 +149,7 @@ def jacobian(chain: Chain, tasks: Tasks, goals: Goals, world: World, seen: Seen)
     lever = jnp.moveaxis(lever, 1, 0)  # (3, 1, B, P)
     columns = cross(lever, along) + jnp.moveaxis(turns, 1, 0)[:, :, :, None] * angular[None, None]
     columns = columns * tasks.recruits[None, None]  # (3, rows, B, P)
-    root = directions * (rootward * tasks.root_recruited)[None, None]  # (rows, 3, B)
+    root = directions * (rootward * tasks.root_recruited * goals.root_free)[None, None]  # (rows, 3, B)
     turning = jnp.transpose(columns, (2, 1, 3, 0)).reshape(3 * tasks.kind.shape[0], 3 * joints)
     return jnp.concatenate([jnp.transpose(root, (2, 0, 1)).reshape(-1, 3), turning], axis=1)
 

@@ -1,0 +1,371 @@
+"""From constraints and a motion to the arrays that the solver runs on.
+
+In: a `Motion`, constraints, settings. Out: a `Plan`: the pruned chain, the tasks sorted by priority, every frame's goals, all
+as NumPy arrays of padded shapes, so that edits of one kind share one compiled program. All errors of structure are raised
+here, before anything is compiled. Places are taken from `origin`, the root's first place, so that precision does not depend
+on where in the world the clip plays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..anthropometry import segment_masses
+from ..errors import KinjaxError, OptionError, ShapeError, UnknownNameError, find_name
+from ..kinematics import pose_paths
+from ..motion import Motion
+from ..skeleton import Topology
+from .chain import Chain
+from .constraints import CenterOfMass, Goal, LookAt, Orientation, Position, title
+from .recruiting import chain_of, check_rule, recruited
+from .sequence import Frames
+from .settings import Settings
+from .targets import Path, Span, look_path, place_path, quaternions, rotations, span_of, turn_path, vector
+from .tasks import CENTER_OF_MASS, LOOK_AT, ORIENTATION, POSITION, Goals, Tasks
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What the solver runs on; shapes as in `Chain`, `Tasks`, `Frames`.
+
+    kept: (P',) skeleton indices of the first P' joints of the chain (the rest is padding). order: indices into the caller's
+    constraints, of the first of the tasks (the rest is padding). titles, units, layer, spans: of the caller's constraints; layer -1
+    where a constraint has weight 0. layers: how many.
+    """
+
+    chain: Chain
+    tasks: Tasks
+    frames: Frames
+    kept: Int[np.ndarray, " p"]
+    order: tuple[int, ...]
+    titles: tuple[str, ...]
+    units: tuple[str, ...]
+    layer: tuple[int, ...]
+    spans: tuple[Span, ...]
+    layers: int
+    origin: Float[np.ndarray, " 3"]
+    notes: tuple[str, ...]
+
+
+class Body:
+    """The input motion in the world, less `origin`, and what constraints look up in it."""
+
+    def __init__(self, motion: Motion):
+        self.motion, self.top = motion, motion.skeleton.topology
+        self.rate, self.frames = float(motion.rate), motion.frames
+        root = np.asarray(motion.translations, float)[:, 0]
+        finite = np.isfinite(root).all(1)
+        self.origin = root[finite.argmax()].copy() if finite.any() else np.zeros(3)
+        self.rotation, self.position = pose_paths(motion)
+        self.position = self.position - self.origin
+        self.notes: list[str] = []
+        self._masses = None
+
+    @property
+    def masses(self):
+        """Mass fractions (J,) and centres (J, 3) of the joints' segments."""
+        if self._masses is None:
+            self._masses = segment_masses(self.motion.skeleton)
+            self.notes += [n for n in self._masses.notes if n not in self.notes]
+        return self._masses
+
+    def point(self, joint: int, local: np.ndarray) -> np.ndarray:
+        """World path (F, 3) of a point of a joint."""
+        if not np.any(local):
+            return self.position[:, joint]
+        return self.position[:, joint] + rotations(_filled(self.rotation[:, joint])).apply(local)
+
+    def center(self) -> np.ndarray:
+        """World path (F, 3) of the centre of mass."""
+        m = self.masses
+        return sum(f * self.point(j, c) for j, (f, c) in enumerate(zip(m.fractions, m.centers, strict=True)) if f > 0)
+
+
+def _filled(q: np.ndarray) -> np.ndarray:
+    """Frames that are not finite as the identity: SciPy takes no others. Their places stay as they are, and flag them."""
+    return np.where(np.isfinite(q).all(-1, keepdims=True), q, np.array([1.0, 0, 0, 0]))
+
+
+def make_plan(motion: Motion, goals: Sequence[Goal], settings: Settings) -> Plan:
+    """Check the constraints against the motion and lay them out; raises `KinjaxError`s that name the constraint."""
+    _check_motion(motion)
+    body = Body(motion)
+    top = body.top
+    titles = tuple(title(g, i) for i, g in enumerate(goals))
+    for g, t in zip(goals, titles, strict=True):
+        _check_common(g, t)
+    spans = tuple(span_of(g, t, body.frames, body.rate) for g, t in zip(goals, titles, strict=True))
+    asked = [_named(t, _task, g, t, s, body) for g, t, s in zip(goals, titles, spans, strict=True)]
+    live = [i for i, g in enumerate(goals) if g.weight > 0]
+    active = np.array([a.path.active for a in asked]).T.reshape(body.frames, len(goals))
+    check_rule(
+        [titles[i] for i in live], [goals[i].priority for i in live], [asked[i].recruits for i in live], active[:, live], top
+    )
+    ranks = sorted({goals[i].priority for i in live}, reverse=True)
+    if settings.strategy == "weights":
+        ranks = ranks[:1]
+    layer = [-1] * len(goals)
+    for i in live:
+        layer[i] = ranks.index(goals[i].priority) if settings.strategy == "priority" else 0
+    order = tuple(sorted(live, key=lambda i: layer[i]))
+    kept = _kept([asked[i] for i in order], top)
+    chain, new = _chain(kept, motion)
+    count = max(len(ranks), 1)
+    tasks, frames = _arrays([asked[i] for i in order], [layer[i] for i in order], count, kept, new, chain, body, settings)
+    units = tuple("rad" if isinstance(g, Orientation | LookAt) else "m" for g in goals)
+    return Plan(
+        chain, tasks, frames, np.array(kept, int), order, titles, units, tuple(layer), spans, count, body.origin, tuple(body.notes)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """One constraint, resolved against the skeleton."""
+
+    kind: int
+    goal: Goal
+    joint: int
+    reference: int
+    recruits: frozenset[int]
+    point: np.ndarray
+    look: np.ndarray
+    axes: np.ndarray
+    path: Path
+    support: tuple[int, ...] = ()
+
+
+def _check_motion(motion: Motion) -> None:
+    if np.ndim(motion.rotations) != 3:
+        raise ShapeError(f"rotations {np.shape(motion.rotations)}: one clip is (frames, joints, 4); deform_many takes several")
+    if motion.frames < 1:
+        raise ShapeError("the motion has no frames")
+
+
+def _check_common(goal: Goal, name: str) -> None:
+    if not isinstance(goal, Position | Orientation | LookAt | CenterOfMass):
+        raise OptionError(f"{name}: a {type(goal).__name__} is no constraint")
+    for what in ("priority", "weight"):
+        value = getattr(goal, what)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+            raise OptionError(f"{name}: {what}={value!r} is not a finite number")
+    if goal.weight < 0:
+        raise OptionError(f"{name}: weight={goal.weight} is negative; 0 switches a constraint off")
+
+
+def _named(name, make, *args):
+    """`make(*args)`, with the constraint's name before the message of what it raises."""
+    try:
+        return make(*args)
+    except UnknownNameError as error:
+        error.args = (f"{name}: {error}",)
+        raise
+    except KinjaxError as error:
+        if not str(error).startswith(name):
+            error.args = (f"{name}: {error}",)
+        raise
+
+
+def _task(goal: Goal, name: str, span: Span, body: Body) -> Asked:
+    """One constraint's joints, path and recruits."""
+    top = body.top
+    joint = 0 if isinstance(goal, CenterOfMass) else find_name(goal.joint, top.names, "joint")
+    reference = -1 if goal.relative_to is None else find_name(goal.relative_to, top.names, "joint")
+    if reference == joint and not isinstance(goal, CenterOfMass):
+        raise OptionError(f"{name}: {top.names[joint]} cannot be relative to itself")
+    recruits = recruited(goal, top, name)
+    axes = _axes(goal, name)
+    point = vector(getattr(goal, "point", (0, 0, 0)), 3, "point", name)
+    look = np.array([0.0, 0, 1])
+    support: tuple[int, ...] = ()
+    to_ref = _relative(body, reference)
+    if isinstance(goal, CenterOfMass):
+        kind = CENTER_OF_MASS
+        path, support = _center_path(goal, name, span, body, to_ref)
+    elif isinstance(goal, Position):
+        kind, path = POSITION, place_path(goal, name, span, to_ref(body.point(joint, point)), body.rate)
+        if reference < 0 and (goal.at is not None or goal.through or goal.path is not None):
+            path = _from_origin(goal, name, span, body, joint, point)
+    elif isinstance(goal, Orientation):
+        own = _filled(body.rotation[:, joint])
+        if reference >= 0:
+            own = quaternions(rotations(_filled(body.rotation[:, reference])).inv() * rotations(own))
+        kind, path = ORIENTATION, turn_path(goal, name, span, own, body.rate)
+        lost = ~np.isfinite(body.rotation[:, joint]).all(1)
+        path.goal[lost] = np.nan
+    else:
+        kind = LOOK_AT
+        look = vector(goal.axis, 3, "axis", name)
+        length = np.linalg.norm(look)
+        if length < 1e-9:
+            raise ShapeError(f"{name}: axis is zero")
+        look = look / length
+        eye = body.point(joint, point)
+        tip = body.point(joint, point + look)
+        world = body.origin if reference < 0 else np.zeros(3)
+        path = look_path(goal, name, span, to_ref(eye) + world, to_ref(tip) - to_ref(eye))
+        path = Path(path.active, path.goal - world)
+    return Asked(kind, goal, joint, reference, recruits, point, look, axes, path, support)
+
+
+def _relative(body: Body, reference: int):
+    """World paths (F, 3) as seen from the reference joint's moving frame."""
+    if reference < 0:
+        return lambda x: x
+    inverse = rotations(_filled(body.rotation[:, reference])).inv()
+    return lambda x: inverse.apply(x - body.position[:, reference])
+
+
+def _from_origin(goal: Position, name: str, span: Span, body: Body, joint: int, point: np.ndarray) -> Path:
+    """World targets that the user gave count from the world's origin, the solver's from `body.origin`."""
+    path = place_path(goal, name, span, body.point(joint, point) + body.origin, body.rate)
+    return Path(path.active, path.goal - body.origin)
+
+
+def _center_path(goal: CenterOfMass, name: str, span: Span, body: Body, to_ref) -> tuple[Path, tuple[int, ...]]:
+    """Where the centre of mass belongs; with supports, relative to their barycentre."""
+    own = body.center()
+    extra = displacement_path(goal.displacement, body.frames, body.rate) if goal.displacement is not None else 0.0
+    if not goal.support:
+        world = 0.0 if goal.relative_to is not None else body.origin
+        path = place_path(goal, name, span, to_ref(own) + world, body.rate)
+        return Path(path.active, path.goal - world + extra), ()
+    if goal.relative_to is not None or goal.at is not None or goal.offset is not None:
+        raise OptionError(f"{name}: support already says relative to what: leave at, offset and relative_to out")
+    support = tuple(find_name(n, body.top.names, "joint") for n in goal.support)
+    base = np.mean([body.position[:, j] for j in support], axis=0)
+    output = leg_length(body.motion.skeleton)
+    offsets = balance_offsets(own, base, goal.leg_length if goal.leg_length is not None else output, output)
+    path = place_path(Position("", begin=goal.begin, end=goal.end), name, span, offsets + extra, body.rate)
+    return path, support
+
+
+def _axes(goal: Goal, name: str) -> np.ndarray:
+    axes = getattr(goal, "axes", "xyz")
+    if not axes or set(axes) - set("xyz") or len(set(axes)) != len(axes):
+        raise OptionError(f"{name}: axes={axes!r}: some of x, y and z, each once")
+    return np.array([float(a in axes) for a in "xyz"])
+
+
+def _kept(asked: Sequence[Asked], top: Topology) -> list[int]:
+    """The joints that constraints see or move, with all their ancestors, in the skeleton's order."""
+    seeds: set[int] = {0} if not asked else set()
+    for a in asked:
+        seeds |= {a.joint, *a.recruits, *a.support} | ({a.reference} if a.reference >= 0 else set())
+    kept = sorted({j for s in seeds for j in chain_of(top, s)})
+    roots = [j for j in kept if top.parents[j] < 0]
+    if len(roots) > 1:
+        raise OptionError(
+            f"constraints on the trees of {' and '.join(top.names[r] for r in roots)}: one tree at a time can be deformed"
+        )
+    return kept
+
+
+def _padded(n: int, step: int) -> int:
+    return -(-n // step) * step
+
+
+def _chain(kept: list[int], motion: Motion) -> tuple[Chain, dict[int, int]]:
+    """The pruned chain, padded to a multiple of four joints, and the place of each skeleton joint in it."""
+    top = motion.skeleton.topology
+    new = {j: i for i, j in enumerate(kept)}
+    p = _padded(len(kept), 4)
+    parents = np.full(p, -1, np.int32)
+    above = np.eye(p)
+    for j, i in new.items():
+        parents[i] = new.get(top.parents[j], -1)
+        for a in chain_of(top, j):
+            above[i, new[a]] = 1
+    limits = None
+    if motion.skeleton.limits is not None:
+        limits = np.tile(np.array([-np.pi, np.pi]) * 4, (p, 3, 1))
+        limits[: len(kept)] = np.asarray(motion.skeleton.limits, float)[kept]
+    return Chain(parents, above, limits), new
+
+
+SIZES = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 28, 32)
+
+
+def _arrays(asked, layer, count, kept, new, chain, body, settings) -> tuple[Tasks, Frames]:
+    """Tasks and frames, padded: constraints to one of `SIZES`, mass points to a multiple of four."""
+    f, p, n = body.frames, len(chain.parents), len(asked)
+    b = next((s for s in SIZES if s >= n), _padded(n, 8))
+    kind, joint = np.zeros(b, np.int32), np.zeros(b, np.int32)
+    reference, layers = np.full(b, p, np.int32), np.full(b, count - 1, np.int32)
+    point, scale, look = np.zeros((b, 3)), np.zeros((b, 3)), np.tile([0.0, 0, 1], (b, 1))
+    recruits, root, above, beside = np.zeros((b, p)), np.zeros(b), np.zeros((b, p)), np.zeros((b, p))
+    active, place, rotation = np.zeros((f, b)), np.zeros((f, b, 3)), np.tile([1.0, 0, 0, 0], (f, b, 1))
+    for i, a in enumerate(asked):
+        kind[i], joint[i], layers[i], point[i], look[i] = a.kind, new[a.joint], layer[i], a.point, a.look
+        scale[i] = a.axes * np.sqrt(a.goal.weight)
+        recruits[i, [new[j] for j in a.recruits]] = 1
+        root[i] = float(any(body.top.parents[j] < 0 for j in a.recruits))
+        above[i] = chain.above[new[a.joint]]
+        if a.reference >= 0:
+            reference[i], beside[i] = new[a.reference], chain.above[new[a.reference]]
+        active[:, i] = a.path.active
+        (rotation if a.kind == ORIENTATION else place)[:, i] = np.where(
+            a.path.active[:, None], a.path.goal, (rotation if a.kind == ORIENTATION else place)[:, i]
+        )
+    centers = [i for i, a in enumerate(asked) if a.kind == CENTER_OF_MASS]
+    mass_joint, mass_point, weights = _mass_points([asked[i] for i in centers], kept, new, body)
+    carried = weights[:, None, :] * chain.above[mass_joint].T[None]
+    tasks = Tasks(
+        kind, joint, reference, point, look, scale, layers, recruits, root, above, beside,
+        np.array(centers, np.int32), mass_joint, weights, carried,
+    )  # fmt: skip
+    used = np.einsum("fb,bp->fp", active, recruits) > 0
+    used_root = (active @ root) > 0
+    return tasks, _frames(kept, p, body, used, used_root, Goals(place, rotation, active, mass_point, np.ones(f)))
+
+
+def _mass_points(asked, kept, new, body):
+    """Mass points of the chain: a kept joint carries its own segment's mass and that of every joint below it that is not kept,
+    whose pose it takes from the input. Joints (M,), places (F, M, 3) in their frames, weights (D, M)."""
+    f, top = body.frames, body.top
+    if not asked:
+        return np.zeros(0, np.int32), np.zeros((f, 0, 3)), np.zeros((0, 0))
+    masses = body.masses
+    holder = list(range(len(top.names)))
+    for j, parent in enumerate(top.parents):
+        if j not in new:
+            holder[j] = holder[parent] if parent >= 0 else -1
+    n = len(kept)
+    support = sorted({j for a in asked for j in a.support})
+    m = _padded(n + len(support), 4)
+    total, moment = np.zeros(m), np.zeros((f, m, 3))
+    for j, (fraction, center) in enumerate(zip(masses.fractions, masses.centers, strict=True)):
+        if fraction > 0 and holder[j] >= 0:
+            to_holder = _relative(body, holder[j])
+            total[new[holder[j]]] += fraction
+            moment[:, new[holder[j]]] += fraction * to_holder(body.point(j, center))
+    place = np.where(total[None, :, None] > 0, moment / np.where(total > 0, total, 1)[None, :, None], 0.0)
+    joint = np.zeros(m, np.int32)
+    joint[:n] = np.arange(n)
+    joint[n : n + len(support)] = [new[j] for j in support]
+    weights = np.tile(total, (len(asked), 1))
+    for d, a in enumerate(asked):
+        for j in a.support:
+            weights[d, n + support.index(j)] -= 1 / len(a.support)
+    return joint, place, weights
+
+
+def _frames(kept, p, body, used, used_root, goals) -> Frames:
+    """The input along the chain."""
+    f, n = body.frames, len(kept)
+    motion, top = body.motion, body.top
+    rotation = np.tile(np.array([1.0, 0, 0, 0])[:, None], (f, 1, p))
+    rotation[:, :, :n] = np.moveaxis(np.asarray(motion.rotations, float)[:, kept], 1, 2)
+    offsets = np.zeros((f, p, 3))
+    offsets[:, :n] = np.asarray(motion.skeleton.offsets, float)[kept]
+    root = np.zeros((f, 3))
+    for k, j in enumerate(top.translated):
+        path = np.asarray(motion.translations, float)[:, k]
+        if top.parents[j] < 0 and j in kept:
+            root = path - body.origin
+        elif j in kept:
+            offsets[:, kept.index(j)] = path
+    return Frames(rotation, root, offsets, used.astype(float), used_root.astype(float), np.ones(f), goals)

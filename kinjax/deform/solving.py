@@ -1,0 +1,178 @@
+"""A plan through the compiled program, piece by piece.
+
+In: a plan and what every frame starts from. Out: `Run`, poses of the whole skeleton. The clip goes through one compiled
+program in pieces of `PIECE` frames: one compilation serves clips of every length, and an edit runs only the pieces that it
+can reach.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from .chain import Pose
+from .frame_solver import Solving
+from .plan import Plan
+from .sequence import Frames, Solved, solve_sequence
+from .settings import Settings
+
+PIECE = 32
+"""Frames that one call of the compiled program solves."""
+
+SAME = 1e-9
+"""Radians and metres within which two poses lead to the same next frames."""
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One pass over a clip: what was asked of each frame (`asked`, digests), the frames that it started from, and `solved`, in
+    the order of the plan's chain and constraints, padding included."""
+
+    plan: Plan
+    asked: list[bytes]
+    frames: Frames
+    solved: Solved
+
+
+@partial(jax.jit, static_argnames=("layers", "iterations", "attract"))
+def _solve(*args: Any, layers: int, iterations: int, attract: tuple[bool, bool]) -> tuple[Pose, Solved]:
+    return solve_sequence(*args, layers=layers, iterations=iterations, attract=attract)
+
+
+@partial(jax.jit, static_argnames=("layers", "iterations", "attract"))
+def _solve_many(*args: Any, layers: int, iterations: int, attract: tuple[bool, bool]) -> tuple[Pose, Solved]:
+    one = partial(solve_sequence, layers=layers, iterations=iterations, attract=attract)
+    return jax.vmap(one, in_axes=(0, 0, 0, 0, None))(*args)
+
+
+def solve(plan: Plan, frames: Frames, asked: list[bytes], settings: Settings, tell: Callable[[int], None], old: Run | None) -> Run:
+    """All frames of one clip. old: an earlier run over the same motion; pieces that would come out the same are its own."""
+    dtype = np.dtype(settings.precision)
+    chain, tasks, cast = (_cast(t, dtype) for t in (plan.chain, plan.tasks, frames))
+    static = {"layers": plan.layers, "iterations": settings.iterations, "attract": (settings.attract, settings.attract_root)}
+    numbers = _solving(settings, dtype)
+    count = len(frames.root)
+    same = _unchanged(frames, asked, plan, old)
+    pose = _pose(cast.rotations[0], cast.root[0])
+    out: list[Solved] = []
+    linked = True  # the pose that enters this piece is the one that entered it in the old run
+    for begin in range(0, count, PIECE):
+        end = min(begin + PIECE, count)
+        if old is not None and linked and same[begin:end].all():
+            piece = _taken(old, plan, begin, end)
+        else:
+            _, piece = _solve(chain, tasks, _piece(cast, begin, end), pose, numbers, **static)
+            piece = jax.tree.map(lambda x, n=end - begin: np.asarray(x)[:n], piece)
+        out.append(piece)
+        pose = _last(piece, pose)
+        linked = old is not None and _close(pose, _last(_taken(old, plan, begin, end), pose))
+        tell(end - begin)
+    return Run(plan, asked, frames, jax.tree.map(lambda *x: np.concatenate(x), *out))
+
+
+def solve_many(plans: Sequence[Plan], settings: Settings, tell: Callable[[int], None]) -> list[Solved]:
+    """Several clips side by side; their plans have arrays of the same shapes (frames apart)."""
+    dtype = np.dtype(settings.precision)
+    static = {"layers": plans[0].layers, "iterations": settings.iterations, "attract": (settings.attract, settings.attract_root)}
+    numbers = _solving(settings, dtype)
+    cast = [_cast(p.frames, dtype) for p in plans]
+    chain, tasks = (_stack([_cast(t, dtype) for t in ts]) for ts in ([p.chain for p in plans], [p.tasks for p in plans]))
+    counts = [len(p.frames.root) for p in plans]
+    pose = _stack([_pose(f.rotations[0], f.root[0]) for f in cast])
+    out: list[Solved] = []
+    for begin in range(0, max(counts), PIECE):
+        pieces = _stack([_piece(f, min(begin, n - 1), min(begin + PIECE, n), begin >= n) for f, n in zip(cast, counts, strict=True)])
+        pose, piece = _solve_many(chain, tasks, pieces, pose, numbers, **static)
+        out.append(jax.tree.map(np.asarray, piece))
+        tell(sum(min(PIECE, max(n - begin, 0)) for n in counts))
+    whole = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *out)
+    return [jax.tree.map(lambda x, i=i, n=n: x[i, :n], whole) for i, n in enumerate(counts)]
+
+
+def _solving(settings: Settings, dtype: np.dtype) -> Solving:
+    return Solving(*(np.asarray(getattr(settings, n), dtype) for n in Solving._fields))
+
+
+def _cast(tree: Any, dtype: np.dtype) -> Any:
+    return jax.tree.map(lambda x: x.astype(dtype) if np.issubdtype(x.dtype, np.floating) else x, tree)
+
+
+def _stack(trees: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *x: np.stack(x), *trees)
+
+
+def _pose(rotations: np.ndarray, root: np.ndarray) -> Pose:
+    """A single trial; parts of a first frame that are not finite begin at rest."""
+    q = np.where(np.isfinite(rotations).all(0), rotations, np.eye(4, 1, dtype=rotations.dtype))
+    return Pose(q[..., None], np.where(np.isfinite(root), root, 0)[:, None])
+
+
+def _piece(frames: Frames, begin: int, end: int, empty: bool = False) -> Frames:
+    """Frames `begin..end-1` filled up to `PIECE` with copies of the last, of which nothing is asked (of none, if `empty`)."""
+    piece = jax.tree.map(lambda x: x[begin:end], frames)
+    more = PIECE - (end - begin)
+    if more:
+        piece = jax.tree.map(lambda x: np.concatenate([x, np.repeat(x[-1:], more, axis=0)]), piece)
+    if more or empty:
+        active = piece.goals.active.copy()
+        active[0 if empty else end - begin :] = 0
+        piece = piece._replace(goals=piece.goals._replace(active=active))
+    return piece
+
+
+def _last(piece: Solved, before: Pose) -> Pose:
+    """The pose that the frame after a piece starts from: the last finite one."""
+    known = np.isfinite(piece.rotations).all((1, 2)) & np.isfinite(piece.root).all(1)
+    if not known.any():
+        return before
+    at = len(known) - 1 - int(known[::-1].argmax())
+    return Pose(piece.rotations[at][..., None], piece.root[at][:, None])
+
+
+def _unchanged(frames: Frames, asked: list[bytes], plan: Plan, old: Run | None) -> np.ndarray:
+    """(F,) the frames of which the same is asked as in the old run, from the same start."""
+    if old is None or len(asked) != len(old.asked):
+        return np.zeros(len(asked), bool)
+    same = np.array([a == b for a, b in zip(asked, old.asked, strict=True)])
+    ours, theirs = _shared(plan, old.plan)
+    same &= (frames.rotations[:, :, ours] == old.frames.rotations[:, :, theirs]).all((1, 2))
+    for name in ("root", "warm"):
+        same &= (getattr(frames, name) == getattr(old.frames, name)).reshape(len(same), -1).all(1)
+    return same & (frames.goals.root_free == old.frames.goals.root_free)
+
+
+def _shared(a: Plan, b: Plan) -> tuple[np.ndarray, np.ndarray]:
+    """Places, in the chains of both plans, of the joints that both have."""
+    return np.flatnonzero(np.isin(a.kept, b.kept)), np.flatnonzero(np.isin(b.kept, a.kept))
+
+
+def _taken(old: Run, plan: Plan, begin: int, end: int) -> Solved:
+    """Frames `begin..end-1` of an old run in the order of this plan's chain and constraints.
+
+    Joints that only this plan has are not controlled in these frames, and are the input's. The constraints that are active
+    in a frame are the same in both plans, in the same order.
+    """
+    ours, theirs = _shared(plan, old.plan)
+    s = jax.tree.map(lambda x: x[begin:end], old.solved)
+    rotations = plan.frames.rotations[begin:end].astype(s.rotations.dtype)
+    rotations[:, :, ours] = s.rotations[:, :, theirs]
+    b, n = plan.frames.goals.active.shape[1], plan.layers
+    solo = np.ones((end - begin, b), s.solo.dtype)
+    own, rank = np.ones((end - begin, n), s.own.dtype), np.zeros((end - begin, n), s.rank.dtype)
+    for f in range(begin, end):
+        new_on, old_on = np.flatnonzero(plan.frames.goals.active[f]), np.flatnonzero(old.plan.frames.goals.active[f])
+        if len(new_on) == len(old_on):
+            solo[f - begin, new_on] = s.solo[f - begin, old_on]
+            to, of = plan.tasks.layer[new_on], old.plan.tasks.layer[old_on]
+            own[f - begin, to], rank[f - begin, to] = s.own[f - begin, of], s.rank[f - begin, of]
+    return s._replace(rotations=rotations, solo=solo, own=own, rank=rank)
+
+
+def _close(a: Pose, b: Pose) -> bool:
+    return bool(max(np.abs(x - y).max(initial=0.0) for x, y in zip(a, b, strict=True)) < SAME)
