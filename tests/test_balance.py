@@ -121,7 +121,7 @@ def test_impossible_displacements(displacement, rate, error, words):
 def test_impossible_rest():
     with pytest.raises(OptionError, match="choose monotone or cubic"):
         displacement_path([(0.5, (1, 2, 3))], 4, 10.0, "linear")
-    with pytest.raises(OptionError, match="input.s leg length is 0"):
+    with pytest.raises(OptionError, match="the input's leg length is 0"):
         balance_offsets(CENTER, FEET, 0.0, 1)
     with pytest.raises(OptionError, match="output's leg length"):
         balance_offsets(CENTER, FEET, 1, np.nan)
