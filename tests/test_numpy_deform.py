@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from benchmarks.numpy_baseline import deform as nd
 from benchmarks.numpy_baseline.deform.rotations import conjugate, exp, log, matrices, multiply, normalized
@@ -30,8 +31,6 @@ def layers(rng, frames=2):
 
 
 def test_rotations():
-    from scipy.spatial.transform import Rotation
-
     rng = np.random.default_rng(0)
     v = rng.normal(size=(50, 3))
     v[0], v[1] = 0.0, 1e-9
@@ -69,6 +68,42 @@ def test_jacobian_is_the_derivative_of_the_errors():
     errors = task.errors(both, near)
     found = -(errors[: task.columns] - errors[task.columns :]).T / 2e-6
     np.testing.assert_allclose(task.jacobian(world), found, atol=2e-6)
+
+
+def test_recruiting():
+    figure, rng = body(), np.random.default_rng(5)
+    goal = rng.normal(size=(1, 3))
+    for kind, joint in (("position", 3), ("com", 0)):
+        task = nd.Task(figure, [[nd.Constraint(kind, goal, joint, recruits=(1, 2))]])
+        whole = nd.Task(figure, [[nd.Constraint(kind, goal, joint)]])
+        world = task.tree.world(np.zeros(3), normalized(rng.normal(size=(len(task.tree.joints), 4))))
+        allowed = np.repeat([False] + [j in (1, 2) for j in task.tree.joints], 3)
+        np.testing.assert_array_equal(task.jacobian(world), whole.jacobian(world) * allowed)
+        assert task.turned.sum() == 2
+
+
+def test_every_kind_of_constraint_is_met_and_free_joints_follow_the_input():
+    rng = np.random.default_rng(6)
+    figure, root, q = body(), rng.normal(size=3), normalized(rng.normal(size=(7, 4)))
+    reference = normalized(multiply(exp(0.02 * np.arange(8)[:, None, None] * rng.normal(size=(7, 3))), q))
+    # goals that some pose meets: those of a pose nearby
+    tree = nd.Tree(figure, range(7))
+    turned = normalized(multiply(exp(0.02 * np.arange(8)[:, None, None] * rng.normal(size=(7, 3))), q))
+    world = tree.world(root + 0.01 * np.arange(8)[:, None], turned)[:, :-1]
+    places = (world @ np.concatenate([figure.centers, np.ones((7, 1))], 1)[..., None])[..., :3, 0]
+    com = np.einsum("j,fjk->fk", figure.masses, places) / figure.masses.sum()
+    facing = np.array([Rotation.from_matrix(m).as_quat()[[3, 0, 1, 2]] for m in world[:, 5, :3, :3]])
+    stack = [
+        [nd.Constraint("position", world[:, 3, :3, 3], 3)],
+        [nd.Constraint("orientation", facing, 5)],
+        [nd.Constraint("com", com, axes=(True, True, False))],
+    ]
+    track = nd.Solver(figure, stack).solve(root, q, reference)
+    assert track.errors.max() < 1e-6
+    np.testing.assert_allclose(np.linalg.norm(track.rotations, axis=-1), 1.0, atol=1e-14)
+    arm = nd.Solver(figure, stack[:1]).solve(root, q, reference)
+    assert arm.errors.max() < 1e-6
+    np.testing.assert_array_equal(arm.rotations[:, [4, 5, 6]], reference[:, [4, 5, 6]])
 
 
 def random_stack(rng, kind):

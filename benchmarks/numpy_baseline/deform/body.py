@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .rotations import exp, matrices, multiply, normalized
+from .rotations import exp, matrices, multiply
 
 
 @dataclass(frozen=True)
@@ -65,12 +65,12 @@ class Tree:
     def moved(self, root, rotations, world, tangent):
         """The states (root, rotations) one tangent (..., 3 + 3 rows) away; one state and many tangents, or one each.
 
-        world: of the states that move.
+        world: of the states that move. Quaternions leave unit length by rounding only; the frame loop sees to that.
         """
         steps = tangent[..., 3:].reshape(*tangent.shape[:-1], -1, 1, 3)
         parents = world.take(self.parent, -3)[..., :3, :3]
         local = (steps @ parents)[..., 0, :]  # R_parent^T w
-        return root + tangent[..., :3], normalized(multiply(exp(local), rotations))
+        return root + tangent[..., :3], multiply(exp(local), rotations)
 
 
 def positions(body, root, rotations):

@@ -20,13 +20,15 @@ for _r, _c, _k, _sign in ((0, 1, 2, 1), (0, 2, 1, -1), (1, 0, 2, -1), (1, 2, 0, 
 @dataclass(frozen=True)
 class Constraint:
     """kind: "position", "orientation" or "com". joint: index, unused for "com". point: (3,) in the joint's frame.
-    goal: (F, 3) world metres, or (F, 4) unit quaternions for an orientation. axes: which of the three rows count."""
+    goal: (F, 3) world metres, or (F, 4) unit quaternions for an orientation. axes: which of the three rows count. recruits: the
+    joints that may serve it (section 4.1), default all above it; the root's translation goes with joint 0."""
 
     kind: str
     goal: np.ndarray
     joint: int = 0
     point: np.ndarray = field(default_factory=lambda: np.zeros(3))
     axes: tuple = (True, True, True)
+    recruits: tuple | None = None
 
     def __post_init__(self):
         if self.kind not in ("position", "orientation", "com"):
@@ -52,14 +54,17 @@ class Task:
         # who turns what: a point on its joint's own origin is not moved by that joint
         above = [body.lineage(c.joint)[0 if np.any(c.point) else 1 :] for c in points]
         above += [body.lineage(c.joint) for c in turns]
-        above += [[j for h in heavy for j in body.lineage(h)[0 if np.any(body.centers[h]) else 1 :]]] if masses else []
-        acts = np.array([[j in line for j in self.tree.joints] for line in above], float)
+        above += [[j for h in heavy for j in body.lineage(h)[0 if np.any(body.centers[h]) else 1 :]] for _ in masses]
+        may = [range(len(body.parents)) if c.recruits is None else c.recruits for c in points + turns + masses]
+        acts = np.array(
+            [[j in line and j in own for j in self.tree.joints] for line, own in zip(above, may, strict=True)], float
+        )
         self.turned = acts.any(0)
         self.columns = 3 + 3 * len(self.tree.joints)
 
         self.joints = np.array([row[c.joint] for c in points], int)
         self.points = np.array([[*c.point, 1.0] for c in points]).reshape(-1, 4, 1)
-        self.acts = acts[: len(points), :, None]
+        self.acts, self.acts_mass = acts[: len(points), :, None], acts[len(points) + len(turns) :, :, None]
         self.turns = np.array([row[c.joint] for c in turns], int)
         self.heavy = np.array([row[h] for h in heavy], int)
         self.shares = body.masses[heavy] / body.masses.sum()
@@ -70,7 +75,7 @@ class Task:
 
         # the part of the Jacobian that no state changes: (constraints, 3, root and rows, 3)
         self.constant = np.zeros((len(flat), 3, 1 + len(self.tree.joints), 3))
-        self.constant[:, :, 0] = np.eye(3)
+        self.constant[:, :, 0] = np.array([0 in own for own in may], float)[:, None, None] * np.eye(3)
         oriented = slice(len(points), len(points) + len(turns))
         self.constant[oriented, :, 0] = 0.0
         self.constant[oriented, :, 1:] = acts[oriented, None, :, None] * np.eye(3)[:, None, :]
@@ -114,7 +119,7 @@ class Task:
             J[:n_points, :, 1:] = self._levers((places[:, None] - pivots) * self.acts)
         if n_mass:  # a joint's lever is to the centre of what it carries, as a share of the body
             levers = self.carries @ self._masses(world) - self.carries.sum(1)[:, None] * pivots
-            J[-n_mass:, :, 1:] = self._levers(levers[None])
+            J[-n_mass:, :, 1:] = self._levers(levers * self.acts_mass)
         rows = J.reshape(-1, self.columns)
         return rows if self.order is None else rows[self.order]
 

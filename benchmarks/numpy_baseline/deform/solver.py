@@ -14,7 +14,7 @@ import numpy as np
 
 from .constraints import Task
 from .linear import gains, posture_step, row_basis, sweep
-from .rotations import conjugate, log, multiply
+from .rotations import conjugate, log, multiply, normalized
 
 
 @dataclass(frozen=True)
@@ -83,6 +83,7 @@ class Solver:
             error = task.errors(state[2], goal)
             for _ in range(self.settings.iterations):
                 state, error, trust = self.iterate(state, error, trust, goal, goals[frame])
+            state = state[0], normalized(state[1]), state[2]
             out_root[frame] = state[0]
             out[frame, joints] = state[1]
             out_errors[frame] = self.norms(error)
