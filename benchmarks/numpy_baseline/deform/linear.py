@@ -21,7 +21,7 @@ def row_basis(J):
     if 0 < m <= n:
         packed, tau, _, _ = dgeqrf(J.T)
         diagonal = packed.diagonal()
-        if (diagonal * diagonal > 1e-12 * np.einsum("ij,ij->i", J, J)).all():
+        if (diagonal * diagonal > 1e-12 * np.vecdot(J, J)).all():
             return packed[:m].T * np.tri(m), dorgqr(packed[:, :m], tau)[0].T
     return gram_schmidt(J)
 
@@ -75,7 +75,7 @@ def sweep(L, spans, gain, errors, clamp=np.inf, budget=np.inf):
     """
     y = np.zeros_like(errors)
     left = budget * budget
-    clamps = [clamp] * len(spans) if np.isscalar(clamp) else clamp
+    clamps = clamp if isinstance(clamp, list) else [clamp] * len(spans)
     for (a, b), G, reach in zip(spans, gain, clamps, strict=True):
         r = errors[..., a:b] - y[..., :a] @ L[a:b, :a].T if a else errors[..., a:b]
         step, squares = shortened(shortened(r, reach * reach)[0] @ G.T, left)
@@ -86,7 +86,7 @@ def sweep(L, spans, gain, errors, clamp=np.inf, budget=np.inf):
 
 def shortened(v, longest):
     """v (..., k) and |v|^2 (...), scaled down to |v|^2 = `longest` (...) where it is more."""
-    squares = np.einsum("...i,...i->...", v, v)
+    squares = np.vecdot(v, v)
     if (squares <= longest).all():
         return v, squares
     factor = np.sqrt(longest / np.maximum(squares, np.maximum(longest, 1e-300)))

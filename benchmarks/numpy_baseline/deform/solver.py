@@ -121,7 +121,7 @@ class Solver:
     def damping(self, J, error):
         """lambda of each layer."""
         s = self.settings
-        floors = s.floor * np.sqrt(np.einsum("ij,ij->i", J, J) @ self.sums)
+        floors = s.floor * np.sqrt(np.vecdot(J, J) @ self.sums)
         return np.maximum(s.damping * np.minimum(self.norms(error) / s.damped_from, 1.0), floors)
 
     def norms(self, error):
