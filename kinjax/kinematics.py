@@ -194,12 +194,3 @@ def quaternions_of(matrices: Float[np.ndarray, "... 3 3"]) -> Float[np.ndarray, 
         raise ShapeError(f"matrix {i} is no rotation: {why}")
     q = Rotation.from_matrix(flat).as_quat(canonical=True)
     return q[:, [3, 0, 1, 2]].reshape(*np.shape(matrices)[:-2], 4)
-
-
-def pose_paths(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """World rotation (frames, joints, 4) and position (frames, joints, 3; metres) of every joint, on the host.
-
-    As `forward_kinematics`, but padded to a bucket of lengths, so that clips share compiled programs, and computed from the
-    roots' first place, so that precision does not depend on where the clip plays.
-    """
-    return _forward_padded(motion)

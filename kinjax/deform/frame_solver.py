@@ -17,11 +17,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..numerics import safe_divide, safe_norm, safe_sqrt
-from ..rotations import conjugate, log, multiply, rotate
-from .chain import Chain, Pose, World, forward, moved, parent_rotations
+from ..numerics import safe_divide, safe_sqrt
+from ..rotations import log
+from .chain import Chain, Pose, World, compose, forward, inverse_of, moved, parent_rotations
 from .prioritized import factorize, layered_step, outside
-from .tasks import Goals, Seen, Tasks, jacobian, look, residuals
+from .tasks import Goals, Kinds, Tasks, jacobian, look, residuals
 
 
 class Solving(NamedTuple):
@@ -33,7 +33,18 @@ class Solving(NamedTuple):
     damped_error: float = 0.05
     slack: float = 1e-6
     slack_ratio: float = 1e-4
-    tolerance: float = 1e-7
+    tolerance: float = 1e-5
+    iterations: float = 10
+
+
+class Tried(NamedTuple):
+    """Candidates: their steps in the row basis, where they lead, and what they leave."""
+
+    along: Float[Array, "m c"]
+    pose: Pose
+    world: World
+    residual: Float[Array, "m c"]
+    errors: Float[Array, "layers c"]
 
 
 class Reference(NamedTuple):
@@ -74,10 +85,10 @@ def solve_frame(
     offsets: Float[Array, "p 3"],
     reference: Reference,
     layers: int,
-    iterations: int,
     solving: Solving,
+    kinds: Kinds,
 ) -> State:
-    """Iterate from `start` until nothing is gained, `iterations` times at most."""
+    """Iterate from `start` until nothing is gained, `solving.iterations` times at most."""
     rows = jnp.repeat(tasks.layer, 3)
     members = (rows[None, :] == jnp.arange(layers, dtype=jnp.int32)[:, None]).astype(offsets.dtype)  # (N, m)
     block = jnp.kron(jnp.eye(tasks.kind.shape[0], dtype=offsets.dtype), jnp.ones((3, 3), offsets.dtype))
@@ -85,14 +96,14 @@ def solve_frame(
     def evaluate(pose: Pose) -> tuple[World, Float[Array, "m c"], Float[Array, "n c"]]:
         world = forward(chain, pose, offsets)
         seen = look(tasks, goals, world)
-        r = residuals(tasks, goals, seen)
+        r = residuals(tasks, goals, seen, kinds)
         r = r.reshape(-1, r.shape[-1])
         return world, r, safe_sqrt(jnp.einsum("nm,mc->nc", members, r * r, precision="highest"))
 
     def iterate(s: State) -> State:
         seen = look(tasks, goals, s.world)
         r0 = s.residual.reshape(-1)
-        jac = jacobian(chain, tasks, goals, s.world, seen)
+        jac = jacobian(chain, tasks, goals, s.world, seen, kinds)
         error = members.T @ s.errors
         damping = solving.damping * jnp.minimum(1, error / solving.damped_error)
         factors = factorize(jac, rows, damping)
@@ -101,23 +112,30 @@ def solve_frame(
         z = attraction(reference, s.pose, parent)
         z = outside(factors.basis, z)
         left = safe_sqrt(solving.budget**2 - y @ y)
-        z = z * jnp.minimum(1, safe_divide(left, safe_norm(z)))
+        z = z * jnp.minimum(1, safe_divide(left, safe_sqrt(z @ z)))
         # candidates: all with z, layers 0..N-1, 0..N-2, ..., 0
         depth = jnp.concatenate([jnp.full((1,), layers, jnp.int32), jnp.arange(layers, 0, -1, dtype=jnp.int32)])
         use = (rows[:, None] < depth[None, :]).astype(jac.dtype)
         posture = (jnp.arange(layers + 1, dtype=jnp.int32) == 0).astype(jac.dtype)
-        step = factors.basis.rows.T @ (y[:, None] * use) + z[:, None] * posture[None, :]
-        trial = moved(chain, s.pose, parent, step)
-        _, r, _ = evaluate(trial)
-        # chord correction: what the step's curvature did to the layers above the last, undone with the same factors
         expected = r0[:, None] - factors.basis.factors @ (y[:, None] * use)
-        depth2 = jnp.maximum(depth - 1, 1) + (posture > 0).astype(jnp.int32)
-        fix = jax.vmap(
-            lambda r: layered_step(factors, r, rows, layers, block, solving.clamp, solving.budget), in_axes=1, out_axes=1
-        )(r - expected)
-        use2 = (rows[:, None] < depth2[None, :]).astype(jac.dtype)
-        trial = moved(chain, s.pose, parent, step + factors.basis.rows.T @ (fix * use2))
-        world, r, errors = evaluate(trial)
+        correct = jax.vmap(
+            lambda r: layered_step(factors, r, rows, layers, block, solving.clamp, solving.budget),
+            in_axes=1,
+            out_axes=1,
+        )
+        # the layers above the last of a candidate (all of them, under posture) take back what the step's curvature did
+        mend = (rows[:, None] < jnp.maximum(depth - 1 + posture.astype(jnp.int32), 1)[None, :]).astype(jac.dtype)
+
+        def attempt(_: Int[Array, ""], tried: Tried) -> Tried:
+            along = tried.along + mend * correct(tried.residual - expected)
+            trial = moved(chain, s.pose, parent, factors.basis.rows.T @ along + z[:, None] * posture[None, :])
+            return Tried(along, trial, *evaluate(trial))
+
+        # nothing has gone wrong before the first attempt: its residuals are those expected
+        spread = jax.tree.map(lambda x: jnp.repeat(x, layers + 1, axis=-1), (s.pose, s.world))
+        none = Tried(y[:, None] * use, *spread, expected, s.errors[:, None] + 0 * posture)
+        along, trial, world, r, errors = jax.lax.fori_loop(0, 2, attempt, none)
+        step = factors.basis.rows.T @ along + z[:, None] * posture[None, :]
         everything = jnp.concatenate([errors, s.errors[:, None]], axis=1)
         best = lexicographic(everything, solving)
         stay = best == layers + 1
@@ -154,7 +172,7 @@ def solve_frame(
         jnp.ones(b, offsets.dtype),
         jnp.ones(layers, offsets.dtype),
     )
-    return jax.lax.while_loop(lambda s: (s.iterations < iterations) & ~s.done, iterate, first)
+    return jax.lax.while_loop(lambda s: (s.iterations < solving.iterations) & ~s.done, iterate, first)
 
 
 def _gains(
@@ -175,12 +193,13 @@ def _gains(
     return solo, safe_divide(safe_sqrt((left * left).sum(1)), layer)
 
 
-def attraction(reference: Reference, pose: Pose, parent: Float[Array, "4 p"]) -> Float[Array, " n"]:
+def attraction(reference: Reference, pose: Pose, parent: Float[Array, "p 3 3"]) -> Float[Array, " n"]:
     """The optimization vector `z` of eq. 1: the step along world axes that would take the pose back to the input."""
     q = pose.rotations[:, :, 0]
-    turn = rotate(parent, log(multiply(reference.rotations, conjugate(q)))) * reference.attracted
+    turn = log(compose(reference.rotations, inverse_of(q))) * reference.attracted
+    turn = jnp.sum(parent * turn.T[:, None, :], axis=-1)  # (P, 3), from the parent's frame to the world
     root = (reference.root - pose.root[:, 0]) * reference.root_attracted
-    return jnp.concatenate([root, turn.T.reshape(-1)])
+    return jnp.concatenate([root, turn.reshape(-1)])
 
 
 def lexicographic(errors: Float[Array, "layers c"], solving: Solving) -> Int[Array, ""]:

@@ -97,7 +97,7 @@ def deform_many(
 
 def _shape(plan: Plan) -> object:
     arrays = jax.tree.leaves((plan.chain, plan.tasks, jax.tree.map(lambda x: x[0], plan.frames)))
-    return plan.layers, plan.chain.limits is None, tuple(a.shape for a in arrays)
+    return plan.layers, plan.kinds, plan.chain.limits is None, tuple(a.shape for a in arrays)
 
 
 def _deform(
@@ -152,7 +152,9 @@ def output_motion(motion: Motion, plan: Plan, solved: Solved) -> Motion:
     top = motion.skeleton.topology
     frames, n = plan.frames, len(plan.kept)
     q = np.array(motion.rotations, float)
-    changed = np.moveaxis(solved.rotations[:, :, :n] != frames.rotations[:, :, :n].astype(solved.rotations.dtype), 1, 2).any(-1)
+    changed = np.moveaxis(
+        solved.rotations[:, :, :n] != frames.rotations[:, :, :n].astype(solved.rotations.dtype), 1, 2
+    ).any(-1)
     new = np.moveaxis(solved.rotations[:, :, :n].astype(float), 1, 2)
     q[:, plan.kept] = np.where(changed[..., None], new, q[:, plan.kept])
     t = np.array(motion.translations, float)

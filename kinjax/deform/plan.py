@@ -14,18 +14,18 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..anthropometry import segment_masses
+from ..anthropometry import leg_length, segment_masses
 from ..errors import KinjaxError, OptionError, ShapeError, UnknownNameError, find_name
-from ..kinematics import pose_paths
 from ..motion import Motion
 from ..skeleton import Topology
+from .balance import balance_offsets, displacement_path
 from .chain import Chain
 from .constraints import CenterOfMass, Goal, LookAt, Orientation, Position, title
 from .recruiting import chain_of, check_rule, recruited
 from .sequence import Frames
 from .settings import Settings
 from .targets import Path, Span, look_path, place_path, quaternions, rotations, span_of, turn_path, vector
-from .tasks import CENTER_OF_MASS, LOOK_AT, ORIENTATION, POSITION, Goals, Tasks
+from .tasks import CENTER_OF_MASS, LOOK_AT, ORIENTATION, POSITION, Goals, Kinds, Tasks
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Plan:
 
     kept: (P',) skeleton indices of the first P' joints of the chain (the rest is padding). order: indices into the caller's
     constraints, of the first of the tasks (the rest is padding). titles, units, layer, spans: of the caller's constraints; layer -1
-    where a constraint has weight 0. layers: how many.
+    where a constraint has weight 0. layers: how many. kinds: what the program has to be able to do.
     """
 
     chain: Chain
@@ -47,6 +47,7 @@ class Plan:
     layer: tuple[int, ...]
     spans: tuple[Span, ...]
     layers: int
+    kinds: Kinds
     origin: Float[np.ndarray, " 3"]
     notes: tuple[str, ...]
 
@@ -60,8 +61,7 @@ class Body:
         root = np.asarray(motion.translations, float)[:, 0]
         finite = np.isfinite(root).all(1)
         self.origin = root[finite.argmax()].copy() if finite.any() else np.zeros(3)
-        self.rotation, self.position = pose_paths(motion)
-        self.position = self.position - self.origin
+        self.rotation, self.position = _world(motion, self.origin)
         self.notes: list[str] = []
         self._masses = None
 
@@ -77,12 +77,40 @@ class Body:
         """World path (F, 3) of a point of a joint."""
         if not np.any(local):
             return self.position[:, joint]
-        return self.position[:, joint] + rotations(_filled(self.rotation[:, joint])).apply(local)
+        return self.position[:, joint] + turned(self.rotation[:, joint], local)
 
     def center(self) -> np.ndarray:
         """World path (F, 3) of the centre of mass."""
         m = self.masses
         return sum(f * self.point(j, c) for j, (f, c) in enumerate(zip(m.fractions, m.centers, strict=True)) if f > 0)
+
+
+def _world(motion: Motion, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """World rotations (F, J, 4) and places (F, J, 3), less `origin`: forward kinematics in NumPy, for which nothing has to be
+    compiled and which is float64 whatever JAX is set to."""
+    top = motion.skeleton.topology
+    q, t = np.asarray(motion.rotations, float), np.asarray(motion.translations, float)
+    rotation, position = np.empty(q.shape), np.empty((*q.shape[:2], 3))
+    for j, parent in enumerate(top.parents):
+        own = t[:, top.translated.index(j)] if j in top.translated else np.asarray(motion.skeleton.offsets[j], float)
+        if parent < 0:
+            rotation[:, j], position[:, j] = q[:, j], own - origin
+        else:
+            rotation[:, j] = _product(rotation[:, parent], q[:, j])
+            position[:, j] = position[:, parent] + turned(rotation[:, parent], own)
+    return rotation, position
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Hamilton product of quaternions (F, 4)."""
+    w = a[:, :1] * b[:, :1] - (a[:, 1:] * b[:, 1:]).sum(1, keepdims=True)
+    return np.concatenate([w, a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])], axis=1)
+
+
+def turned(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Vectors (F, 3) or (3,) turned by quaternions (F, 4)."""
+    u = 2 * np.cross(q[:, 1:], v)
+    return v + q[:, :1] * u + np.cross(q[:, 1:], u)
 
 
 def _filled(q: np.ndarray) -> np.ndarray:
@@ -103,7 +131,11 @@ def make_plan(motion: Motion, goals: Sequence[Goal], settings: Settings) -> Plan
     live = [i for i, g in enumerate(goals) if g.weight > 0]
     active = np.array([a.path.active for a in asked]).T.reshape(body.frames, len(goals))
     check_rule(
-        [titles[i] for i in live], [goals[i].priority for i in live], [asked[i].recruits for i in live], active[:, live], top
+        [titles[i] for i in live],
+        [goals[i].priority for i in live],
+        [asked[i].recruits for i in live],
+        active[:, live],
+        top,
     )
     ranks = sorted({goals[i].priority for i in live}, reverse=True)
     if settings.strategy == "weights":
@@ -115,10 +147,30 @@ def make_plan(motion: Motion, goals: Sequence[Goal], settings: Settings) -> Plan
     kept = _kept([asked[i] for i in order], top)
     chain, new = _chain(kept, motion)
     count = max(len(ranks), 1)
-    tasks, frames = _arrays([asked[i] for i in order], [layer[i] for i in order], count, kept, new, chain, body, settings)
+    tasks, frames = _arrays(
+        [asked[i] for i in order], [layer[i] for i in order], count, kept, new, chain, body, settings
+    )
+    used = [asked[i] for i in order]
+    kinds = Kinds(
+        any(a.kind == ORIENTATION for a in used),
+        any(a.kind == LOOK_AT for a in used),
+        any(a.reference >= 0 for a in used),
+    )
     units = tuple("rad" if isinstance(g, Orientation | LookAt) else "m" for g in goals)
     return Plan(
-        chain, tasks, frames, np.array(kept, int), order, titles, units, tuple(layer), spans, count, body.origin, tuple(body.notes)
+        chain,
+        tasks,
+        frames,
+        np.array(kept, int),
+        order,
+        titles,
+        units,
+        tuple(layer),
+        spans,
+        count,
+        kinds,
+        body.origin,
+        tuple(body.notes),
     )
 
 
@@ -140,7 +192,9 @@ class Asked:
 
 def _check_motion(motion: Motion) -> None:
     if np.ndim(motion.rotations) != 3:
-        raise ShapeError(f"rotations {np.shape(motion.rotations)}: one clip is (frames, joints, 4); deform_many takes several")
+        raise ShapeError(
+            f"rotations {np.shape(motion.rotations)}: one clip is (frames, joints, 4); deform_many takes several"
+        )
     if motion.frames < 1:
         raise ShapeError("the motion has no frames")
 
@@ -228,7 +282,7 @@ def _from_origin(goal: Position, name: str, span: Span, body: Body, joint: int, 
 def _center_path(goal: CenterOfMass, name: str, span: Span, body: Body, to_ref) -> tuple[Path, tuple[int, ...]]:
     """Where the centre of mass belongs; with supports, relative to their barycentre."""
     own = body.center()
-    extra = displacement_path(goal.displacement, body.frames, body.rate) if goal.displacement is not None else 0.0
+    extra = 0.0 if goal.displacement is None else displacement_path(_in_seconds(goal, body), body.frames, body.rate)
     if not goal.support:
         world = 0.0 if goal.relative_to is not None else body.origin
         path = place_path(goal, name, span, to_ref(own) + world, body.rate)
@@ -236,11 +290,19 @@ def _center_path(goal: CenterOfMass, name: str, span: Span, body: Body, to_ref) 
     if goal.relative_to is not None or goal.at is not None or goal.offset is not None:
         raise OptionError(f"{name}: support already says relative to what: leave at, offset and relative_to out")
     support = tuple(find_name(n, body.top.names, "joint") for n in goal.support)
-    base = np.mean([body.position[:, j] for j in support], axis=0)
+    base = body.position[:, support]
     output = leg_length(body.motion.skeleton)
     offsets = balance_offsets(own, base, goal.leg_length if goal.leg_length is not None else output, output)
     path = place_path(Position("", begin=goal.begin, end=goal.end), name, span, offsets + extra, body.rate)
     return path, support
+
+
+def _in_seconds(goal: CenterOfMass, body: Body):
+    """The displacement with its key frames, if it has any, as times."""
+    keys = goal.displacement
+    if isinstance(keys, np.ndarray) or np.isscalar(keys[0]):
+        return keys
+    return [(k[0] / body.rate, k[1]) for k in keys] if np.ndim(keys[0][1]) else keys
 
 
 def _axes(goal: Goal, name: str) -> np.ndarray:

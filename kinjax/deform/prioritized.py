@@ -73,9 +73,7 @@ class Layered(NamedTuple):
     """R without those blocks: what the steps of the layers above do to a layer."""
 
 
-def factorize(
-    jacobian: Float[Array, "m n"], layer: Int[Array, " m"], damping: Float[Array, " m"]
-) -> Layered:
+def factorize(jacobian: Float[Array, "m n"], layer: Int[Array, " m"], damping: Float[Array, " m"]) -> Layered:
     """Basis and damped inverses of all layers at once.
 
     layer: of each row, not decreasing. damping: lambda of each row's layer, in units of the Jacobian; it is raised to

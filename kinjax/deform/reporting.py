@@ -40,7 +40,11 @@ def residual_table(motion: Motion, plan: Plan) -> Float[np.ndarray, "f b"]:
             off = (goal * own.inv()).as_rotvec() * axes
             value = np.linalg.norm(off, axis=1)
         else:
-            point = _center(body, plan, b) if tasks.kind[b] == CENTER_OF_MASS else body.position[:, joint] + seen.apply(tasks.point[b])
+            point = (
+                _center(body, plan, b)
+                if tasks.kind[b] == CENTER_OF_MASS
+                else body.position[:, joint] + seen.apply(tasks.point[b])
+            )
             place = point - origin if back is None else back.apply(point - origin)
             away = goals.place[:, b] - place
             if tasks.kind[b] == LOOK_AT:
@@ -49,7 +53,11 @@ def residual_table(motion: Motion, plan: Plan) -> Float[np.ndarray, "f b"]:
                 value = np.arctan2(np.linalg.norm(np.cross(along, away), axis=1), (along * away).sum(1))
             else:
                 value = np.linalg.norm(away * axes, axis=1)
-        lost = ~np.isfinite(body.rotation[:, joint]).all(1) | ~np.isfinite(goals.place[:, b]).all(1) | ~np.isfinite(goals.rotation[:, b]).all(1)
+        lost = (
+            ~np.isfinite(body.rotation[:, joint]).all(1)
+            | ~np.isfinite(goals.place[:, b]).all(1)
+            | ~np.isfinite(goals.rotation[:, b]).all(1)
+        )
         out[:, b] = np.where((goals.active[:, b] > 0) & ~lost, value, np.nan)
     return out
 
@@ -103,7 +111,9 @@ def make_report(before: Motion, after: Motion, plan: Plan, solved: Solved, setti
     change[~(np.isfinite(q0).all(-1) & np.isfinite(q1).all(-1))] = np.nan
     top = before.skeleton.topology
     root = top.translated.index(int(plan.kept[0])) if len(plan.kept) and int(plan.kept[0]) in top.translated else 0
-    moved = np.linalg.norm(np.asarray(after.translations, float)[:, root] - np.asarray(before.translations, float)[:, root], axis=1)
+    moved = np.linalg.norm(
+        np.asarray(after.translations, float)[:, root] - np.asarray(before.translations, float)[:, root], axis=1
+    )
     return Report(
         titles=plan.titles,
         unit=tuple(plan.units),

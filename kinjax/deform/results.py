@@ -49,7 +49,9 @@ class Report:
 
     def frame_status(self) -> Int[np.ndarray, " f"]:
         """The worst status of each frame's constraints."""
-        order = np.array([0, 1, 4, 2, 3, 5, 6])  # how bad: free, converged, max_iter, unreachable, conflict, stalled, nonfinite
+        order = np.array(
+            [0, 1, 4, 2, 3, 5, 6]
+        )  # how bad: free, converged, max_iter, unreachable, conflict, stalled, nonfinite
         badness = np.array([0, 1, 5, 3, 4, 2, 6])
         if not self.status.shape[1]:
             return np.zeros(len(self.status), int)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .chain import Chain, Pose
 from .frame_solver import Reference, Solving, solve_frame
-from .tasks import Goals, Tasks
+from .tasks import Goals, Kinds, Tasks
 
 
 class Frames(NamedTuple):
@@ -53,7 +53,7 @@ def solve_sequence(
     first: Pose,
     solving: Solving,
     layers: int,
-    iterations: int,
+    kinds: Kinds,
     attract: tuple[bool, bool] = (True, True),
 ) -> tuple[Pose, Solved]:
     """All frames in their order, from the pose `first` (C = 1); gives the last pose, too.
@@ -68,8 +68,13 @@ def solve_sequence(
             jnp.where((x.controlled * x.warm)[None, :, None] > 0, last.rotations, own.rotations),
             jnp.where(x.root_controlled * x.warm * x.goals.root_free > 0, last.root, own.root),
         )
-        reference = Reference(x.rotations, x.root, attract[0] * x.controlled, attract[1] * x.root_controlled * x.goals.root_free)
-        s = solve_frame(chain, tasks, x.goals, start, x.offsets, reference, layers, iterations, solving)
+        reference = Reference(
+            x.rotations,
+            x.root,
+            float(attract[0]) * x.controlled,
+            float(attract[1]) * x.root_controlled * x.goals.root_free,
+        )
+        s = solve_frame(chain, tasks, x.goals, start, x.offsets, reference, layers, solving, kinds)
         sound = jnp.isfinite(s.pose.rotations).all() & jnp.isfinite(s.pose.root).all() & jnp.isfinite(s.errors).all()
         pose = Pose(
             jnp.where(sound & (x.controlled[None, :, None] > 0), s.pose.rotations, own.rotations),

@@ -21,6 +21,7 @@ from .frame_solver import Solving
 from .plan import Plan
 from .sequence import Frames, Solved, solve_sequence
 from .settings import Settings
+from .tasks import Kinds
 
 PIECE = 32
 """Frames that one call of the compiled program solves."""
@@ -40,22 +41,24 @@ class Run:
     solved: Solved
 
 
-@partial(jax.jit, static_argnames=("layers", "iterations", "attract"))
-def _solve(*args: Any, layers: int, iterations: int, attract: tuple[bool, bool]) -> tuple[Pose, Solved]:
-    return solve_sequence(*args, layers=layers, iterations=iterations, attract=attract)
+@partial(jax.jit, static_argnames=("layers", "kinds", "attract"))
+def _solve(*args: Any, layers: int, kinds: Kinds, attract: tuple[bool, bool]) -> tuple[Pose, Solved]:
+    return solve_sequence(*args, layers=layers, kinds=kinds, attract=attract)
 
 
-@partial(jax.jit, static_argnames=("layers", "iterations", "attract"))
-def _solve_many(*args: Any, layers: int, iterations: int, attract: tuple[bool, bool]) -> tuple[Pose, Solved]:
-    one = partial(solve_sequence, layers=layers, iterations=iterations, attract=attract)
+@partial(jax.jit, static_argnames=("layers", "kinds", "attract"))
+def _solve_many(*args: Any, layers: int, kinds: Kinds, attract: tuple[bool, bool]) -> tuple[Pose, Solved]:
+    one = partial(solve_sequence, layers=layers, kinds=kinds, attract=attract)
     return jax.vmap(one, in_axes=(0, 0, 0, 0, None))(*args)
 
 
-def solve(plan: Plan, frames: Frames, asked: list[bytes], settings: Settings, tell: Callable[[int], None], old: Run | None) -> Run:
+def solve(
+    plan: Plan, frames: Frames, asked: list[bytes], settings: Settings, tell: Callable[[int], None], old: Run | None
+) -> Run:
     """All frames of one clip. old: an earlier run over the same motion; pieces that would come out the same are its own."""
     dtype = np.dtype(settings.precision)
     chain, tasks, cast = (_cast(t, dtype) for t in (plan.chain, plan.tasks, frames))
-    static = {"layers": plan.layers, "iterations": settings.iterations, "attract": (settings.attract, settings.attract_root)}
+    static = {"layers": plan.layers, "kinds": plan.kinds, "attract": (settings.attract, settings.attract_root)}
     numbers = _solving(settings, dtype)
     count = len(frames.root)
     same = _unchanged(frames, asked, plan, old)
@@ -79,15 +82,19 @@ def solve(plan: Plan, frames: Frames, asked: list[bytes], settings: Settings, te
 def solve_many(plans: Sequence[Plan], settings: Settings, tell: Callable[[int], None]) -> list[Solved]:
     """Several clips side by side; their plans have arrays of the same shapes (frames apart)."""
     dtype = np.dtype(settings.precision)
-    static = {"layers": plans[0].layers, "iterations": settings.iterations, "attract": (settings.attract, settings.attract_root)}
+    static = {"layers": plans[0].layers, "kinds": plans[0].kinds, "attract": (settings.attract, settings.attract_root)}
     numbers = _solving(settings, dtype)
     cast = [_cast(p.frames, dtype) for p in plans]
-    chain, tasks = (_stack([_cast(t, dtype) for t in ts]) for ts in ([p.chain for p in plans], [p.tasks for p in plans]))
+    chain, tasks = (
+        _stack([_cast(t, dtype) for t in ts]) for ts in ([p.chain for p in plans], [p.tasks for p in plans])
+    )
     counts = [len(p.frames.root) for p in plans]
     pose = _stack([_pose(f.rotations[0], f.root[0]) for f in cast])
     out: list[Solved] = []
     for begin in range(0, max(counts), PIECE):
-        pieces = _stack([_piece(f, min(begin, n - 1), min(begin + PIECE, n), begin >= n) for f, n in zip(cast, counts, strict=True)])
+        pieces = _stack(
+            [_piece(f, min(begin, n - 1), min(begin + PIECE, n), begin >= n) for f, n in zip(cast, counts, strict=True)]
+        )
         pose, piece = _solve_many(chain, tasks, pieces, pose, numbers, **static)
         out.append(jax.tree.map(np.asarray, piece))
         tell(sum(min(PIECE, max(n - begin, 0)) for n in counts))

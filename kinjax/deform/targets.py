@@ -66,7 +66,11 @@ def _frame(value: object, what: str, title: str) -> int:
 def ramp(span: Span, frames: int) -> np.ndarray:
     """(F,) 1 in `begin..end`, 0 outside `first..last`, and a smooth step (zero velocity and acceleration) between."""
     t = np.arange(frames, dtype=float)
-    up = np.clip((t - span.first) / max(span.begin - span.first, 1), 0, 1) if span.begin > span.first else t >= span.begin
+    up = (
+        np.clip((t - span.first) / max(span.begin - span.first, 1), 0, 1)
+        if span.begin > span.first
+        else t >= span.begin
+    )
     down = np.clip((span.last - t) / max(span.last - span.end, 1), 0, 1) if span.last > span.end else t <= span.end
     x = np.minimum(up, down).astype(float)
     return x**3 * (10 - 15 * x + 6 * x * x)
@@ -89,7 +93,9 @@ def _path(value: object, span: Span, width: int, title: str) -> np.ndarray:
     if path.shape != want:
         raise ShapeError(f"{title}: path has shape {path.shape}; frames {span.begin}..{span.end} need {want}")
     if not np.isfinite(path).all():
-        raise ShapeError(f"{title}: path has numbers that are not finite in its row {int((~np.isfinite(path)).any(1).argmax())}")
+        raise ShapeError(
+            f"{title}: path has numbers that are not finite in its row {int((~np.isfinite(path)).any(1).argmax())}"
+        )
     return path
 
 
@@ -102,7 +108,9 @@ def _one_of(goal: Goal, names: tuple[str, ...], title: str) -> None:
 def _unit(q: np.ndarray, what: str, title: str) -> np.ndarray:
     n = np.linalg.norm(q, axis=-1)
     if np.any(np.abs(n - 1) > 1e-2):
-        raise ShapeError(f"{title}: {what} must be unit quaternions wxyz; a length of {n.flat[np.abs(n - 1).argmax()]:.4g} was found")
+        raise ShapeError(
+            f"{title}: {what} must be unit quaternions wxyz; a length of {n.flat[np.abs(n - 1).argmax()]:.4g} was found"
+        )
     return q / n[..., None]
 
 
@@ -135,9 +143,20 @@ def _passes(passes: tuple[Through, ...], span: Span, width: int, rate: float, ti
         first = _frame(p.frame, "frame of a pass", title)
         last = first if p.until is None else _frame(p.until, "until of a pass", title)
         if not span.first <= first <= last <= span.last:
-            raise OptionError(f"{title}: a pass in frames {first}..{last} is outside the constraint's {span.first}..{span.last}")
+            raise OptionError(
+                f"{title}: a pass in frames {first}..{last} is outside the constraint's {span.first}..{span.last}"
+            )
         at = vector(p.at, width, "at of a pass", title)
-        out.append(Pass(first / rate, last / rate, _unit(at, "at of a pass", title) if width == 4 else at, p.tension, p.continuity, p.bias))
+        out.append(
+            Pass(
+                first / rate,
+                last / rate,
+                _unit(at, "at of a pass", title) if width == 4 else at,
+                p.tension,
+                p.continuity,
+                p.bias,
+            )
+        )
     return out
 
 
