@@ -4,6 +4,7 @@ In: a `Motion` and constraints. Out: `Deformation`, the new motion and a report.
 edit, `deform_many` takes several clips at once.
 """
 
+from .cleaning import clean, constraints_from
 from .constraints import CenterOfMass, Goal, LookAt, Orientation, Position, Through
 from .pipeline import deform, deform_many, redeform
 from .results import STATUSES, Deformation, Report
@@ -20,6 +21,8 @@ __all__ = [
     "Report",
     "Settings",
     "Through",
+    "clean",
+    "constraints_from",
     "deform",
     "deform_many",
     "redeform",

@@ -68,16 +68,28 @@ class Layered(NamedTuple):
 
     basis: Basis
     pull: Float[Array, "m m"]
-    """Damped inverse of each layer's own block of R: `R_ii' (R_ii R_ii' + lambda_i^2)^-1`."""
+    """Damped inverse of each layer's own block of R: `(R_ii' R_ii + lambda_i^2 + G_i)^-1 R_ii'`."""
+    rest: Float[Array, " m"]
+    """What the drag `G` adds to each layer's step."""
     carry: Float[Array, "m m"]
     """R without those blocks: what the steps of the layers above do to a layer."""
 
 
-def factorize(jacobian: Float[Array, "m n"], layer: Int[Array, " m"], damping: Float[Array, " m"]) -> Layered:
+def factorize(
+    jacobian: Float[Array, "m n"],
+    layer: Int[Array, " m"],
+    damping: Float[Array, " m"],
+    drag: tuple[Array, Array | float] | None = None,
+    travel: Float[Array, " n"] | None = None,
+) -> Layered:
     """Basis and damped inverses of all layers at once.
 
     layer: of each row, not decreasing. damping: lambda of each row's layer, in units of the Jacobian; it is raised to
     `1e-6 |J_i|` in float64 and `1e-3 |J_i|` in float32, below which rounding would decide.
+
+    drag: (strength (m,) of each row's layer, sigma) holds a layer back where it is nearly singular: along a direction with
+    singular value `s` it is `G = strength^2 / (1 + (s / sigma)^2)^8`, and it pulls at the whole `travel` (n,), not only at
+    this step, so that what it allows does not depend on the number of steps.
     """
     basis = row_basis(jacobian)
     same = layer[:, None] == layer[None, :]
@@ -86,8 +98,17 @@ def factorize(jacobian: Float[Array, "m n"], layer: Int[Array, " m"], damping: F
     least = 1e-6 if jacobian.dtype == jnp.float64 else 1e-3
     lambda2 = jnp.maximum(damping * damping, least**2 * size2)
     lambda2 = jnp.where(lambda2 > 0, lambda2, jnp.ones_like(lambda2))
-    pull = own.T @ inverse(own @ own.T + jnp.diag(lambda2))
-    return Layered(basis, pull, basis.factors - own)
+    normal = own.T @ own
+    carry = basis.factors - own
+    if drag is None or travel is None:
+        return Layered(basis, inverse(normal + jnp.diag(lambda2)) @ own.T, jnp.zeros_like(lambda2), carry)
+    strength, sigma = drag
+    fade = inverse(jnp.eye(len(lambda2), dtype=own.dtype) + normal / sigma**2)
+    fade = fade @ fade
+    fade = fade @ fade
+    hold = (strength[:, None] * strength[None, :]) * (fade @ fade)
+    solve = inverse(normal + jnp.diag(lambda2) + hold)
+    return Layered(basis, solve @ own.T, -solve @ (hold @ (basis.rows @ travel)), carry)
 
 
 def inverse(a: Float[Array, "m m"]) -> Float[Array, "m m"]:
@@ -115,21 +136,23 @@ def layered_step(
     layer: Int[Array, " m"],
     layers: int,
     block: Float[Array, "m m"],
-    clamp: Float[Array, ""] | float,
+    clamp: Float[Array, "*m"] | float,
     budget: Float[Array, ""] | float,
+    drag: bool = False,
 ) -> Float[Array, " m"]:
     """Coordinates `y` of the step in the row basis: `dm = y Q`. Those of a layer do not depend on the layers below it.
 
     residual: what each row should still move by. block: ones where two rows belong to one constraint; a constraint asks for
-    `clamp` at most. budget: the longest step in all, spent in order of priority (cutting the whole step would let a lower
-    layer's long step shrink a higher one's).
+    `clamp` at most (one number, or one a row). budget: the longest step in all, spent in order of priority (cutting the whole step would let a lower
+    layer's long step shrink a higher one's). drag: whether the drag of `factorize` takes part.
     """
+    rest = factors.rest if drag else jnp.zeros_like(factors.rest)
 
     def sweep(_: Int[Array, ""], y: Float[Array, " m"]) -> Float[Array, " m"]:
         r = residual - factors.carry @ y
         length = safe_sqrt(block @ (r * r))
-        r = r * jnp.minimum(1, safe_divide(jnp.full_like(length, clamp), length))
-        y = factors.pull @ r
+        r = r * jnp.minimum(1, safe_divide(jnp.broadcast_to(jnp.asarray(clamp, length.dtype), length.shape), length))
+        y = factors.pull @ r + rest
         # what the layers above have spent, and what this one asks for
         spent = jnp.where(layer[None, :] < layer[:, None], (y * y)[None, :], 0).sum(1)
         asked = jnp.where(layer[None, :] == layer[:, None], (y * y)[None, :], 0).sum(1)

@@ -44,25 +44,34 @@ class Solved(NamedTuple):
     own: Float[Array, "f layers"]
     stayed: Bool[Array, " f"]
     sound: Bool[Array, " f"]
+    trust: Float[Array, "f layers"]
+
+
+class Carried(NamedTuple):
+    """What a frame hands to the next: its pose (C = 1) and the trust of its layers (`State`)."""
+
+    pose: Pose
+    trust: Float[Array, " layers"]
 
 
 def solve_sequence(
     chain: Chain,
     tasks: Tasks,
     frames: Frames,
-    first: Pose,
+    first: Carried,
     solving: Solving,
     layers: int,
     kinds: Kinds,
     attract: tuple[bool, bool] = (True, True),
-) -> tuple[Pose, Solved]:
+) -> tuple[Carried, Solved]:
     """All frames in their order, from the pose `first` (C = 1); gives the last pose, too.
 
     attract: whether joints, and the root's translation, are drawn to the input. A frame whose solve is not finite restarts
     from the input and is flagged; where the input itself is not finite, the next frame starts from the last sound one.
     """
 
-    def step(last: Pose, x: Frames) -> tuple[Pose, Solved]:
+    def step(carried: Carried, x: Frames) -> tuple[Carried, Solved]:
+        last, trust = carried
         own = Pose(x.rotations[..., None], x.root[:, None])
         start = Pose(
             jnp.where((x.controlled * x.warm)[None, :, None] > 0, last.rotations, own.rotations),
@@ -74,17 +83,18 @@ def solve_sequence(
             float(attract[0]) * x.controlled,
             float(attract[1]) * x.root_controlled * x.goals.root_free,
         )
-        s = solve_frame(chain, tasks, x.goals, start, x.offsets, reference, layers, solving, kinds)
+        s = solve_frame(chain, tasks, x.goals, start, x.offsets, reference, layers, solving, kinds, trust)
         sound = jnp.isfinite(s.pose.rotations).all() & jnp.isfinite(s.pose.root).all() & jnp.isfinite(s.errors).all()
         pose = Pose(
             jnp.where(sound & (x.controlled[None, :, None] > 0), s.pose.rotations, own.rotations),
             jnp.where(sound & (x.root_controlled * x.goals.root_free > 0), s.pose.root, own.root),
         )
         known = jnp.isfinite(pose.rotations).all() & jnp.isfinite(pose.root).all()
-        carried = Pose(jnp.where(known, pose.rotations, last.rotations), jnp.where(known, pose.root, last.root))
+        kept = Pose(jnp.where(known, pose.rotations, last.rotations), jnp.where(known, pose.root, last.root))
+        trust = jnp.where(sound, s.trust, trust)
         out = Solved(
-            pose.rotations[..., 0], pose.root[:, 0], s.iterations, s.rank, s.solo, s.own, s.stayed, sound
+            pose.rotations[..., 0], pose.root[:, 0], s.iterations, s.rank, s.solo, s.own, s.stayed, sound, trust
         )  # fmt: skip
-        return carried, out
+        return Carried(kept, trust), out
 
     return jax.lax.scan(step, first, frames)

@@ -23,7 +23,9 @@ class Settings:
 
     clamp: metres that a constraint asks for in one iteration at most. budget: length of one step (radians and metres
     together), spent in order of priority. damping: lambda of a layer whose error is `damped_error` metres or more; it falls
-    with the error. slack, slack_ratio: how much a layer may lose to a lower one in one iteration, metres and share.
+    with the error. drag, singular: the lowest layer is held back along directions in which it is nearly singular (singular
+    values around `singular` metres a radian and below), by `drag` in the same unit: a limb that straightens does not snap;
+    0 for none. slack, slack_ratio: how much a layer may lose to a lower one in one iteration, metres and share.
 
     filter_root, filter_joints: cutoff in Hz of the low-pass filter of the displacement map's root translation and joint
     rotations, None for no filter. A map that is smooth to within `rough` metres (or radians) is left alone.
@@ -42,6 +44,8 @@ class Settings:
     budget: float = 1.0
     damping: float = 0.3
     damped_error: float = 0.05
+    drag: float = 0.3
+    singular: float = 0.2
     slack: float = 1e-7
     slack_ratio: float = 1e-4
     filter_root: float | None = 4.0
@@ -59,9 +63,9 @@ class Settings:
             value = getattr(self, name)
             if not isinstance(value, int) or isinstance(value, bool) or value < 1:
                 raise OptionError(f"{name}={value!r}: a whole number from 1 is needed")
-        for name in ("clamp", "budget", "damped_error", "filter_width", "rough", "held"):
+        for name in ("clamp", "budget", "damped_error", "singular", "filter_width", "rough", "held"):
             _positive(name, getattr(self, name))
-        for name in ("tolerance", "damping", "slack", "slack_ratio"):
+        for name in ("tolerance", "damping", "slack", "slack_ratio", "drag"):
             _positive(name, getattr(self, name), zero=True)
         for name in ("filter_root", "filter_joints"):
             if getattr(self, name) is not None:

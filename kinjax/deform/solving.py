@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from .chain import Pose
 from .frame_solver import Solving
 from .plan import Plan
-from .sequence import Frames, Solved, solve_sequence
+from .sequence import Carried, Frames, Solved, solve_sequence
 from .settings import Settings
 from .tasks import Kinds
 
@@ -42,12 +42,12 @@ class Run:
 
 
 @partial(jax.jit, static_argnames=("layers", "kinds", "attract"))
-def _solve(*args: Any, layers: int, kinds: Kinds, attract: tuple[bool, bool]) -> tuple[Pose, Solved]:
+def _solve(*args: Any, layers: int, kinds: Kinds, attract: tuple[bool, bool]) -> tuple[Carried, Solved]:
     return solve_sequence(*args, layers=layers, kinds=kinds, attract=attract)
 
 
 @partial(jax.jit, static_argnames=("layers", "kinds", "attract"))
-def _solve_many(*args: Any, layers: int, kinds: Kinds, attract: tuple[bool, bool]) -> tuple[Pose, Solved]:
+def _solve_many(*args: Any, layers: int, kinds: Kinds, attract: tuple[bool, bool]) -> tuple[Carried, Solved]:
     one = partial(solve_sequence, layers=layers, kinds=kinds, attract=attract)
     return jax.vmap(one, in_axes=(0, 0, 0, 0, None))(*args)
 
@@ -62,7 +62,7 @@ def solve(
     numbers = _solving(settings, dtype)
     count = len(frames.root)
     same = _unchanged(frames, asked, plan, old)
-    pose = _pose(cast.rotations[0], cast.root[0])
+    pose = _begin(cast.rotations[0], cast.root[0], plan.layers)
     out: list[Solved] = []
     linked = True  # the pose that enters this piece is the one that entered it in the old run
     for begin in range(0, count, PIECE):
@@ -89,7 +89,7 @@ def solve_many(plans: Sequence[Plan], settings: Settings, tell: Callable[[int], 
         _stack([_cast(t, dtype) for t in ts]) for ts in ([p.chain for p in plans], [p.tasks for p in plans])
     )
     counts = [len(p.frames.root) for p in plans]
-    pose = _stack([_pose(f.rotations[0], f.root[0]) for f in cast])
+    pose = _stack([_begin(f.rotations[0], f.root[0], plans[0].layers) for f in cast])
     out: list[Solved] = []
     for begin in range(0, max(counts), PIECE):
         pieces = _stack(
@@ -114,10 +114,10 @@ def _stack(trees: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *x: np.stack(x), *trees)
 
 
-def _pose(rotations: np.ndarray, root: np.ndarray) -> Pose:
-    """A single trial; parts of a first frame that are not finite begin at rest."""
+def _begin(rotations: np.ndarray, root: np.ndarray, layers: int) -> Any:
+    """What the first frame starts from; parts of it that are not finite begin at rest."""
     q = np.where(np.isfinite(rotations).all(0), rotations, np.eye(4, 1, dtype=rotations.dtype))
-    return Pose(q[..., None], np.where(np.isfinite(root), root, 0)[:, None])
+    return Carried(Pose(q[..., None], np.where(np.isfinite(root), root, 0)[:, None]), np.ones(layers, root.dtype))
 
 
 def _piece(frames: Frames, begin: int, end: int, empty: bool = False) -> Frames:
@@ -133,13 +133,13 @@ def _piece(frames: Frames, begin: int, end: int, empty: bool = False) -> Frames:
     return piece
 
 
-def _last(piece: Solved, before: Pose) -> Pose:
-    """The pose that the frame after a piece starts from: the last finite one."""
+def _last(piece: Solved, before: Any) -> Any:
+    """What the frame after a piece starts from: the last finite pose, and the trust."""
     known = np.isfinite(piece.rotations).all((1, 2)) & np.isfinite(piece.root).all(1)
     if not known.any():
         return before
     at = len(known) - 1 - int(known[::-1].argmax())
-    return Pose(piece.rotations[at][..., None], piece.root[at][:, None])
+    return Carried(Pose(piece.rotations[at][..., None], piece.root[at][:, None]), piece.trust[-1])
 
 
 def _unchanged(frames: Frames, asked: list[bytes], plan: Plan, old: Run | None) -> np.ndarray:
@@ -172,14 +172,16 @@ def _taken(old: Run, plan: Plan, begin: int, end: int) -> Solved:
     b, n = plan.frames.goals.active.shape[1], plan.layers
     solo = np.ones((end - begin, b), s.solo.dtype)
     own, rank = np.ones((end - begin, n), s.own.dtype), np.zeros((end - begin, n), s.rank.dtype)
+    trust = s.trust if n == old.plan.layers else np.ones((end - begin, n), s.trust.dtype)
     for f in range(begin, end):
         new_on, old_on = np.flatnonzero(plan.frames.goals.active[f]), np.flatnonzero(old.plan.frames.goals.active[f])
         if len(new_on) == len(old_on):
             solo[f - begin, new_on] = s.solo[f - begin, old_on]
             to, of = plan.tasks.layer[new_on], old.plan.tasks.layer[old_on]
             own[f - begin, to], rank[f - begin, to] = s.own[f - begin, of], s.rank[f - begin, of]
-    return s._replace(rotations=rotations, solo=solo, own=own, rank=rank)
+    return s._replace(rotations=rotations, solo=solo, own=own, rank=rank, trust=trust)
 
 
-def _close(a: Pose, b: Pose) -> bool:
-    return bool(max(np.abs(x - y).max(initial=0.0) for x, y in zip(a, b, strict=True)) < SAME)
+def _close(a: Any, b: Any) -> bool:
+    gaps = [np.abs(x - y).max(initial=0.0) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)]
+    return bool(max(gaps) < SAME)
