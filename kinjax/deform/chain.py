@@ -96,15 +96,17 @@ def inverse_of(q: Float[Array, "4 ..."]) -> Float[Array, "4 ..."]:
 def moved(chain: Chain, pose: Pose, parent: Float[Array, "p 3 3"], step: Float[Array, "n c"]) -> Pose:
     """The trials that `step` makes of the one pose (C = 1) whose joints' parents have world rotations `parent`.
 
-    step: root translation, then for each joint a rotation vector, all along world axes. Limits are kept by clamping the
-    rotation vector of a joint's rotation.
+    step: root translation, then for each joint a rotation vector, all along world axes. A turn by `w` is made by Cayley's map,
+    the quaternion along (1, w / 2): the exponential up to the third order, without its sines. Limits are kept by clamping
+    the rotation vector of a joint's rotation.
     """
     joints = parent.shape[0]
     turn = step[3:].reshape(joints, 3, -1)
     local = jnp.sum(
         parent[:, :, :, None] * turn[:, :, None, :], axis=1
     )  # R_parent^T w: the same turn seen from the parent
-    q = normalize(compose(exp(jnp.moveaxis(local, 1, 0)), pose.rotations))
+    turn = jnp.concatenate([jnp.ones_like(local[:, :1]), local / 2], axis=1)
+    q = normalize(compose(jnp.moveaxis(turn, 1, 0), pose.rotations))
     if chain.limits is not None:
         q = within_limits(q, chain.limits)
     return Pose(q, pose.root + step[:3])

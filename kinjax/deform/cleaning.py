@@ -40,9 +40,9 @@ from .targets import quaternions, rotations
 EASE = 0.1
 """Seconds in which a joint is brought to its held place before a constraint, and let go after it."""
 
-SETTINGS = Settings(slack=1e-5)
+SETTINGS = Settings(slack=1e-4)
 """What `clean` uses unless told otherwise. While a foot is held the rest of the body follows the input, in its null space; that
-curves, so a constraint that already holds must be allowed to lose some micrometres in a step that it gets back in the next."""
+curves, so a constraint that already holds must be allowed to lose a little in a step; it gets it back in the next."""
 
 SHORTEST = 5
 """Frames of a line or point that must remain for it to be held."""

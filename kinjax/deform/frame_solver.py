@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..numerics import safe_divide, safe_sqrt
 from ..rotations import log
 from .chain import Chain, Pose, World, compose, forward, inverse_of, moved, parent_rotations
-from .prioritized import factorize, layered_step, outside
+from .prioritized import factorize, layered_step, outside, times
 from .tasks import Goals, Kinds, Tasks, jacobian, look, residuals
 
 
@@ -174,7 +174,7 @@ class _Iteration:
         world = forward(self.chain, pose, self.offsets)
         r = residuals(self.tasks, self.goals, look(self.tasks, self.goals, world), self.kinds)
         r = r.reshape(-1, r.shape[-1])
-        return world, r, safe_sqrt(jnp.einsum("nm,mc->nc", self.members, r * r, precision="highest"))
+        return world, r, safe_sqrt(times(self.members, r * r))
 
     def begin(self, pose: Pose, trust: Float[Array, " layers"]) -> State:
         """The state before the first iteration; done where nothing is asked, or where it is not finite."""
@@ -215,10 +215,10 @@ class _Iteration:
         last = jnp.concatenate([jnp.full((1,), layers, jnp.int32), jnp.arange(layers, 0, -1, dtype=jnp.int32)])
         posture = (jnp.arange(layers + 1, dtype=jnp.int32) == 0).astype(jac.dtype)
         use = (rows[:, None] < last[None, :]).astype(jac.dtype)
-        expected = r0[:, None] - factors.basis.factors @ (y[:, None] * use)
+        expected = r0[:, None] - times(factors.basis.factors, y[:, None] * use)
         # the layers above the last of a candidate (all of them, under posture) take back what the step's curvature did
         mend = (rows[:, None] < jnp.maximum(last - 1 + posture.astype(jnp.int32), 1)[None, :]).astype(jac.dtype)
-        fix = jax.vmap(partial(correct, clamp=solving.clamp), in_axes=1, out_axes=1)
+        fix = partial(correct, clamp=solving.clamp)
 
         below = jnp.arange(layers, dtype=jnp.int32)[:, None] >= depth
 
@@ -227,7 +227,7 @@ class _Iteration:
 
         def attempt(tried: Tried) -> Tried:
             along = tried.along + mend * fix(wrong(tried.residual))
-            trial = moved(self.chain, s.pose, parent, across.T @ along + z[:, None] * posture[None, :])
+            trial = moved(self.chain, s.pose, parent, times(across.T, along) + z[:, None] * posture[None, :])
             world, r, errors = self.evaluate(trial)
             everything = jnp.concatenate([errors, s.errors[:, None]], axis=1)
             allowed = (everything <= caps[:, None]).all(0).at[-1].set(True)
@@ -244,7 +244,7 @@ class _Iteration:
         zero = jnp.zeros((), jnp.int32)
         none = Tried(y[:, None] * use, *spread, expected, s.errors[:, None] + 0 * posture, zero, zero)
         along, trial, world, r, errors, best, _ = jax.lax.while_loop(unsettled, attempt, none)
-        step = across.T @ along + z[:, None] * posture[None, :]
+        step = times(across.T, along) + z[:, None] * posture[None, :]
         stay = best == layers + 1
         pick = jnp.minimum(best, layers)
 
@@ -290,8 +290,8 @@ def _gains(
     whole = safe_sqrt(size.reshape(-1, 3).sum(1)) * safe_sqrt((r * r).reshape(-1, 3).sum(1))
     solo = safe_divide(safe_sqrt((pull * pull).sum(1)), whole)
     same = (rows[:, None] == rows[None, :]).astype(jac.dtype)
-    left = members @ (factors * same * r[:, None])  # (N, m): each layer's own R_ii' r
-    layer = safe_sqrt(members @ size) * safe_sqrt(members @ (r * r))
+    left = times(members, factors * same * r[:, None])  # (N, m): each layer's own R_ii' r
+    layer = safe_sqrt(members @ size) * safe_sqrt(times(members, r * r))
     return solo, safe_divide(safe_sqrt((left * left).sum(1)), layer)
 
 

@@ -32,6 +32,12 @@ class Basis(NamedTuple):
     factors: Float[Array, "m m"]
 
 
+def times(a: Float[Array, "i j"], b: Float[Array, "j *k"]) -> Float[Array, "i *k"]:
+    """Product of small matrices, written out: a library call would cost more than the arithmetic, and keep XLA from making
+    one native function of the loop around it."""
+    return jnp.sum(a.reshape(*a.shape, *[1] * (b.ndim - 1)) * b[None], axis=1)
+
+
 def row_basis(jacobian: Float[Array, "m n"]) -> Basis:
     """Orthonormal basis of the rows in their order, by classical Gram-Schmidt applied twice.
 
@@ -98,17 +104,17 @@ def factorize(
     least = 1e-6 if jacobian.dtype == jnp.float64 else 1e-3
     lambda2 = jnp.maximum(damping * damping, least**2 * size2)
     lambda2 = jnp.where(lambda2 > 0, lambda2, jnp.ones_like(lambda2))
-    normal = own.T @ own
+    normal = times(own.T, own)
     carry = basis.factors - own
     if drag is None or travel is None:
-        return Layered(basis, inverse(normal + jnp.diag(lambda2)) @ own.T, jnp.zeros_like(lambda2), carry)
+        return Layered(basis, times(inverse(normal + jnp.diag(lambda2)), own.T), jnp.zeros_like(lambda2), carry)
     strength, sigma = drag
     fade = inverse(jnp.eye(len(lambda2), dtype=own.dtype) + normal / sigma**2)
-    fade = fade @ fade
-    fade = fade @ fade
-    hold = (strength[:, None] * strength[None, :]) * (fade @ fade)
+    fade = times(fade, fade)
+    fade = times(fade, fade)
+    hold = (strength[:, None] * strength[None, :]) * times(fade, fade)
     solve = inverse(normal + jnp.diag(lambda2) + hold)
-    return Layered(basis, solve @ own.T, -solve @ (hold @ (basis.rows @ travel)), carry)
+    return Layered(basis, times(solve, own.T), -times(solve, times(hold, basis.rows @ travel)), carry)
 
 
 def inverse(a: Float[Array, "m m"]) -> Float[Array, "m m"]:
@@ -132,31 +138,37 @@ def inverse(a: Float[Array, "m m"]) -> Float[Array, "m m"]:
 
 def layered_step(
     factors: Layered,
-    residual: Float[Array, " m"],
+    residual: Float[Array, "m *c"],
     layer: Int[Array, " m"],
     layers: int,
     block: Float[Array, "m m"],
     clamp: Float[Array, "*m"] | float,
     budget: Float[Array, ""] | float,
     drag: bool = False,
-) -> Float[Array, " m"]:
+) -> Float[Array, "m *c"]:
     """Coordinates `y` of the step in the row basis: `dm = y Q`. Those of a layer do not depend on the layers below it.
 
-    residual: what each row should still move by. block: ones where two rows belong to one constraint; a constraint asks for
+    residual: what each row should still move by, of one trial or of several (last axis). block: ones where two rows belong to one constraint; a constraint asks for
     `clamp` at most (one number, or one a row). budget: the longest step in all, spent in order of priority (cutting the whole step would let a lower
     layer's long step shrink a higher one's). drag: whether the drag of `factorize` takes part.
     """
     rest = factors.rest if drag else jnp.zeros_like(factors.rest)
 
-    def sweep(_: Int[Array, ""], y: Float[Array, " m"]) -> Float[Array, " m"]:
-        r = residual - factors.carry @ y
-        length = safe_sqrt(block @ (r * r))
-        r = r * jnp.minimum(1, safe_divide(jnp.broadcast_to(jnp.asarray(clamp, length.dtype), length.shape), length))
-        y = factors.pull @ r + rest
+    below = layer[None, :] < layer[:, None]
+    beside = layer[None, :] == layer[:, None]
+    shape = (-1, *[1] * (residual.ndim - 1))
+    most = jnp.broadcast_to(jnp.asarray(clamp, residual.dtype), layer.shape).reshape(shape)
+    rest = rest.reshape(shape)
+
+    def sweep(_: Int[Array, ""], y: Float[Array, "m *c"]) -> Float[Array, "m *c"]:
+        r = residual - times(factors.carry, y)
+        length = safe_sqrt(times(block, r * r))
+        r = r * jnp.minimum(1, safe_divide(jnp.broadcast_to(most, length.shape), length))
+        y = times(factors.pull, r) + rest
         # what the layers above have spent, and what this one asks for
-        spent = jnp.where(layer[None, :] < layer[:, None], (y * y)[None, :], 0).sum(1)
-        asked = jnp.where(layer[None, :] == layer[:, None], (y * y)[None, :], 0).sum(1)
-        left = safe_sqrt(budget**2 - spent)
+        square = y * y
+        left = safe_sqrt(budget**2 - times(below.astype(y.dtype), square))
+        asked = times(beside.astype(y.dtype), square)
         return y * jnp.where(asked > left * left, safe_divide(left, safe_sqrt(asked)), jnp.ones_like(asked))
 
     # layer i is final after i + 1 sweeps
