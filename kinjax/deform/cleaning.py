@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -137,7 +138,8 @@ class _Held:
                 f"the annotations are of a clip of {annotations.frames} frames, and {self.name} has {self.frames}"
             )
         found = list(annotations.constraints if isinstance(annotations, Annotations) else annotations)
-        rests, rolls = [], []
+        rests: list[_Rest] = []
+        rolls: list[Constraint] = []
         for c in sorted(found, key=lambda c: (c.begin, c.end)):
             if not 0 <= c.begin <= c.end < self.frames:
                 raise OptionError(
@@ -270,7 +272,7 @@ class _Held:
         """Whether two joints are one, or one the other's parent: what holds one of them binds the other."""
         return a == b or self.top.parents[a] == b or self.top.parents[b] == a
 
-    def _eases(self, begin: int, end: int, others: Iterable[tuple[int, int]], shared: bool = True) -> dict[str, float]:
+    def _eases(self, begin: int, end: int, others: Iterable[tuple[int, int]], shared: bool = True) -> dict[str, Any]:
         """Seconds before and after: as asked, or up to the nearest of the `others`; half the way if that eases, too (`shared`)."""
         part = 2 if shared else 1
         frames_in = frames_out = self.ease

@@ -104,7 +104,7 @@ class LookAt(_Common):
 
 @dataclass(frozen=True)
 class CenterOfMass(_Common):
-    """The centre of mass, moved by the root unless more is recruited (2004 paper, section 4.3).
+    """The centre of mass, for which the whole body is recruited unless joints are listed (2004 paper, section 4.3).
 
     Without `support` it keeps its original trajectory. With `support`, names of joints, it keeps its place relative to their
     barycentre: N1 (P' - mean A') = N2 (P - mean A), with lengths measured in legs; `leg_length`: of the figure that the

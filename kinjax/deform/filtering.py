@@ -17,7 +17,7 @@ def taps(cutoff: float, width: float, rate: float) -> Float[np.ndarray, " k"]:
 
     cutoff: Hz. A cutoff at or above half the rate, or a width under one frame, gives the filter that changes nothing.
     """
-    half = int(round(width * rate))
+    half = round(width * rate)
     if half < 1 or cutoff >= rate / 2:
         return np.ones(1)
     return firwin(2 * half + 1, cutoff, fs=rate)

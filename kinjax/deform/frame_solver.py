@@ -39,7 +39,7 @@ class Solving(NamedTuple):
     slack: float = 1e-6
     slack_ratio: float = 1e-4
     tolerance: float = 1e-5
-    iterations: float = 10
+    iterations: int = 10
     drag: float = 0.3
     singular: float = 0.2
 
@@ -242,7 +242,7 @@ class _Iteration:
         # nothing has gone wrong before the first attempt: its residuals are those expected
         spread = jax.tree.map(lambda x: jnp.repeat(x, layers + 1, axis=-1), (s.pose, s.world))
         zero = jnp.zeros((), jnp.int32)
-        none = Tried(y[:, None] * use, *spread, expected, s.errors[:, None] + 0 * posture, zero, zero)
+        none = Tried(y[:, None] * use, spread[0], spread[1], expected, s.errors[:, None] + 0 * posture, zero, zero)
         along, trial, world, r, errors, best, _ = jax.lax.while_loop(unsettled, attempt, none)
         step = times(across.T, along) + z[:, None] * posture[None, :]
         stay = best == layers + 1

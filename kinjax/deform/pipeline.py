@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -22,7 +23,6 @@ from .plan import Plan, make_plan
 from .reporting import make_report, residual_table
 from .results import Deformation
 from .reuse import signatures
-from .sequence import Frames, Solved
 from .settings import Settings
 from .solving import Run, solve, solve_many
 from .targets import quaternions, rotations
@@ -147,7 +147,7 @@ def _worse(motion: Motion, plan: Plan, runs: list[Run], settings: Settings) -> b
     return bool((np.nan_to_num(after) > np.nan_to_num(before) + settings.held).any())
 
 
-def output_motion(motion: Motion, plan: Plan, solved: Solved) -> Motion:
+def output_motion(motion: Motion, plan: Plan, solved: Any) -> Motion:
     """The input with the chain's joints and root as solved; whatever was not controlled stays as it is, bit for bit."""
     top = motion.skeleton.topology
     frames, n = plan.frames, len(plan.kept)
@@ -166,7 +166,7 @@ def output_motion(motion: Motion, plan: Plan, solved: Solved) -> Motion:
     return replace(motion, translations=t, rotations=q)
 
 
-def smoothed(plan: Plan, solved: Solved, settings: Settings, rate: float) -> Frames | None:
+def smoothed(plan: Plan, solved: Any, settings: Settings, rate: float) -> Any:
     """The frames of the next pass, which start at the filtered poses and are drawn to them; None when nothing is rough."""
     frames = plan.frames
     root, turned = frames.root, frames.rotations

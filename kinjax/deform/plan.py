@@ -9,12 +9,13 @@ on where in the world the clip plays.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..anthropometry import leg_length, segment_masses
+from ..anthropometry import SegmentMasses, leg_length, segment_masses
 from ..errors import KinjaxError, OptionError, ShapeError, UnknownNameError, find_name
 from ..motion import Motion
 from ..skeleton import Topology
@@ -30,16 +31,16 @@ from .tasks import CENTER_OF_MASS, LOOK_AT, ORIENTATION, POSITION, Goals, Kinds,
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What the solver runs on; shapes as in `Chain`, `Tasks`, `Frames`.
+    """What the solver runs on: a `Chain`, `Tasks` and `Frames` of NumPy arrays.
 
     kept: (P',) skeleton indices of the first P' joints of the chain (the rest is padding). order: indices into the caller's
     constraints, of the first of the tasks (the rest is padding). titles, units, layer, spans: of the caller's constraints; layer -1
     where a constraint has weight 0. layers: how many. kinds: what the program has to be able to do.
     """
 
-    chain: Chain
-    tasks: Tasks
-    frames: Frames
+    chain: Any
+    tasks: Any
+    frames: Any
     kept: Int[np.ndarray, " p"]
     order: tuple[int, ...]
     titles: tuple[str, ...]
@@ -53,20 +54,65 @@ class Plan:
 
 
 class Body:
-    """The input motion in the world, less `origin`, and what constraints look up in it."""
+    """A motion in the world, less `origin`, and what constraints look up in it.
 
-    def __init__(self, motion: Motion):
+    Joints are placed when they are asked for, in NumPy: nothing has to be compiled for it, and it is float64 whatever JAX is
+    set to.
+    """
+
+    def __init__(self, motion: Motion, origin: np.ndarray | None = None):
         self.motion, self.top = motion, motion.skeleton.topology
         self.rate, self.frames = float(motion.rate), motion.frames
-        root = np.asarray(motion.translations, float)[:, 0]
-        finite = np.isfinite(root).all(1)
-        self.origin = root[finite.argmax()].copy() if finite.any() else np.zeros(3)
-        self.rotation, self.position = _world(motion, self.origin)
+        if origin is None:
+            root = np.asarray(motion.translations, float)[:, 0]
+            finite = np.isfinite(root).all(1)
+            origin = root[finite.argmax()].copy() if finite.any() else np.zeros(3)
+        self.origin = origin
         self.notes: list[str] = []
-        self._masses = None
+        self._masses: SegmentMasses | None = None
+        self._world: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+    def _at(self, joint: int) -> tuple[np.ndarray, np.ndarray]:
+        """World quaternion (4, F) and place (3, F) of a joint."""
+        missing = [j for j in chain_of(self.top, joint) if j not in self._world]
+        for j in reversed(missing):
+            q = np.ascontiguousarray(np.asarray(self.motion.rotations[:, j], float).T)
+            if j in self.top.translated:
+                own = np.asarray(self.motion.translations[:, self.top.translated.index(j)], float).T
+            else:
+                own = np.asarray(self.motion.skeleton.offsets[j], float)[:, None]
+            if self.top.parents[j] < 0:
+                self._world[j] = q, own - self.origin[:, None]
+            else:
+                up, place = self._world[self.top.parents[j]]
+                self._world[j] = _product(up, q), place + _turned(up, own)
+        return self._world[joint]
+
+    def turn(self, joint: int) -> np.ndarray:
+        """World quaternions (F, 4) of a joint."""
+        return self._at(joint)[0].T
+
+    def place(self, joint: int) -> np.ndarray:
+        """World places (F, 3) of a joint, less the origin."""
+        return self._at(joint)[1].T
 
     @property
-    def masses(self):
+    def rotation(self) -> np.ndarray:
+        """World quaternions (F, J, 4) of all joints."""
+        return np.stack([self.turn(j) for j in range(len(self.top.names))], axis=1)
+
+    @property
+    def position(self) -> np.ndarray:
+        """World places (F, J, 3) of all joints, less the origin."""
+        return np.stack([self.place(j) for j in range(len(self.top.names))], axis=1)
+
+    def lost(self, joint: int) -> np.ndarray:
+        """(F,) where a joint's pose is not finite."""
+        q, p = self._at(joint)
+        return ~(np.isfinite(q).all(0) & np.isfinite(p).all(0))
+
+    @property
+    def masses(self) -> SegmentMasses:
         """Mass fractions (J,) and centres (J, 3) of the joints' segments."""
         if self._masses is None:
             self._masses = segment_masses(self.motion.skeleton)
@@ -75,45 +121,39 @@ class Body:
 
     def point(self, joint: int, local: np.ndarray) -> np.ndarray:
         """World path (F, 3) of a point of a joint."""
-        if not np.any(local):
-            return self.position[:, joint]
-        return self.position[:, joint] + turned(self.rotation[:, joint], local)
+        q, p = self._at(joint)
+        return (p + _turned(q, np.asarray(local, float)[:, None])).T if np.any(local) else p.T
 
     def center(self) -> np.ndarray:
         """World path (F, 3) of the centre of mass."""
         m = self.masses
-        return sum(f * self.point(j, c) for j, (f, c) in enumerate(zip(m.fractions, m.centers, strict=True)) if f > 0)
-
-
-def _world(motion: Motion, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """World rotations (F, J, 4) and places (F, J, 3), less `origin`: forward kinematics in NumPy, for which nothing has to be
-    compiled and which is float64 whatever JAX is set to."""
-    top = motion.skeleton.topology
-    q, t = np.asarray(motion.rotations, float), np.asarray(motion.translations, float)
-    rotation, position = np.empty(q.shape), np.empty((*q.shape[:2], 3))
-    for j, parent in enumerate(top.parents):
-        own = t[:, top.translated.index(j)] if j in top.translated else np.asarray(motion.skeleton.offsets[j], float)
-        if parent < 0:
-            rotation[:, j], position[:, j] = q[:, j], own - origin
-        else:
-            rotation[:, j] = _product(rotation[:, parent], q[:, j])
-            position[:, j] = position[:, parent] + turned(rotation[:, parent], own)
-    return rotation, position
+        parts = [f * self.point(j, c) for j, (f, c) in enumerate(zip(m.fractions, m.centers, strict=True)) if f > 0]
+        return np.sum(parts, axis=0)
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Hamilton product of quaternions (F, 4)."""
-    w = a[:, :1] * b[:, :1] - (a[:, 1:] * b[:, 1:]).sum(1, keepdims=True)
-    return np.concatenate([w, a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])], axis=1)
+    """Hamilton product of quaternions (4, F)."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ]
+    )
 
 
-def turned(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Vectors (F, 3) or (3,) turned by quaternions (F, 4)."""
-    u = 2 * np.cross(q[:, 1:], v)
-    return v + q[:, :1] * u + np.cross(q[:, 1:], u)
+def _turned(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Vectors (3, F or 1) turned by quaternions (4, F)."""
+    w, x, y, z = q
+    a, b, c = v
+    ta, tb, tc = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
+    return np.stack([a + w * ta + y * tc - z * tb, b + w * tb + z * ta - x * tc, c + w * tc + x * tb - y * ta])
 
 
-def _filled(q: np.ndarray) -> np.ndarray:
+def filled(q: np.ndarray) -> np.ndarray:
     """Frames that are not finite as the identity: SciPy takes no others. Their places stay as they are, and flag them."""
     return np.where(np.isfinite(q).all(-1, keepdims=True), q, np.array([1.0, 0, 0, 0]))
 
@@ -130,10 +170,12 @@ def make_plan(motion: Motion, goals: Sequence[Goal], settings: Settings) -> Plan
     asked = [_named(t, _task, g, t, s, body) for g, t, s in zip(goals, titles, spans, strict=True)]
     live = [i for i, g in enumerate(goals) if g.weight > 0]
     active = np.array([a.path.active for a in asked]).T.reshape(body.frames, len(goals))
+    asked = _whole_bodies(goals, asked, body)
     check_rule(
         [titles[i] for i in live],
         [goals[i].priority for i in live],
         [asked[i].recruits for i in live],
+        [_movers(asked[i], top) for i in live],
         active[:, live],
         top,
     )
@@ -190,6 +232,39 @@ class Asked:
     support: tuple[int, ...] = ()
 
 
+LIGHT = 0.01
+"""Joints that carry a smaller share of the body's mass are not moved for the sake of its centre."""
+
+
+def _whole_bodies(goals: Sequence[Goal], asked: list[Asked], body: Body) -> list[Asked]:
+    """Centres of mass that name no joints recruit the whole body: every joint that carries a share of its mass worth moving,
+    and, since these move the centre too, every joint that another constraint recruits."""
+    if not any(isinstance(g, CenterOfMass) and g.recruits is None for g in goals):
+        return asked
+    carried = np.array(body.masses.fractions, float)
+    for j in range(len(carried) - 1, 0, -1):
+        if body.top.parents[j] >= 0:
+            carried[body.top.parents[j]] += carried[j]
+    whole = frozenset(int(j) for j in np.flatnonzero(carried >= LIGHT))
+    named = [a.recruits for g, a in zip(goals, asked, strict=True) if not isinstance(g, CenterOfMass) or g.recruits is not None]
+    whole = whole.union(*named)
+    return [
+        replace(a, recruits=whole) if isinstance(g, CenterOfMass) and g.recruits is None else a
+        for g, a in zip(goals, asked, strict=True)
+    ]
+
+
+def _movers(asked: Asked, top: Topology) -> frozenset[int]:
+    """Joints whose turns a constraint feels."""
+    if asked.kind == CENTER_OF_MASS:
+        return frozenset(range(len(top.names)))
+    own = chain_of(top, asked.joint)
+    if asked.kind == POSITION and not asked.point.any():
+        own = own[1:]
+    beside = chain_of(top, asked.reference) if asked.reference >= 0 else []
+    return frozenset(own) ^ frozenset(beside)
+
+
 def _check_motion(motion: Motion) -> None:
     if np.ndim(motion.rotations) != 3:
         raise ShapeError(
@@ -244,12 +319,11 @@ def _task(goal: Goal, name: str, span: Span, body: Body) -> Asked:
         if reference < 0 and (goal.at is not None or goal.through or goal.path is not None):
             path = _from_origin(goal, name, span, body, joint, point)
     elif isinstance(goal, Orientation):
-        own = _filled(body.rotation[:, joint])
+        own = filled(body.turn(joint))
         if reference >= 0:
-            own = quaternions(rotations(_filled(body.rotation[:, reference])).inv() * rotations(own))
+            own = quaternions(rotations(filled(body.turn(reference))).inv() * rotations(own))
         kind, path = ORIENTATION, turn_path(goal, name, span, own, body.rate)
-        lost = ~np.isfinite(body.rotation[:, joint]).all(1)
-        path.goal[lost] = np.nan
+        path.goal[body.lost(joint)] = np.nan
     else:
         kind = LOOK_AT
         look = vector(goal.axis, 3, "axis", name)
@@ -269,8 +343,8 @@ def _relative(body: Body, reference: int):
     """World paths (F, 3) as seen from the reference joint's moving frame."""
     if reference < 0:
         return lambda x: x
-    inverse = rotations(_filled(body.rotation[:, reference])).inv()
-    return lambda x: inverse.apply(x - body.position[:, reference])
+    inverse = rotations(filled(body.turn(reference))).inv()
+    return lambda x: inverse.apply(x - body.place(reference))
 
 
 def _from_origin(goal: Position, name: str, span: Span, body: Body, joint: int, point: np.ndarray) -> Path:
@@ -290,7 +364,7 @@ def _center_path(goal: CenterOfMass, name: str, span: Span, body: Body, to_ref) 
     if goal.relative_to is not None or goal.at is not None or goal.offset is not None:
         raise OptionError(f"{name}: support already says relative to what: leave at, offset and relative_to out")
     support = tuple(find_name(n, body.top.names, "joint") for n in goal.support)
-    base = body.position[:, support]
+    base = np.stack([body.place(j) for j in support], axis=1)
     output = leg_length(body.motion.skeleton)
     offsets = balance_offsets(own, base, goal.leg_length if goal.leg_length is not None else output, output)
     path = place_path(Position("", begin=goal.begin, end=goal.end), name, span, offsets + extra, body.rate)
@@ -299,7 +373,7 @@ def _center_path(goal: CenterOfMass, name: str, span: Span, body: Body, to_ref) 
 
 def _in_seconds(goal: CenterOfMass, body: Body):
     """The displacement with its key frames, if it has any, as times."""
-    keys = goal.displacement
+    keys: Any = goal.displacement
     if isinstance(keys, np.ndarray) or np.isscalar(keys[0]):
         return keys
     return [(k[0] / body.rate, k[1]) for k in keys] if np.ndim(keys[0][1]) else keys
@@ -326,11 +400,16 @@ def _kept(asked: Sequence[Asked], top: Topology) -> list[int]:
     return kept
 
 
+def _laid(kind: Any, *arrays: Any) -> Any:
+    """A record of the solver's that holds NumPy arrays."""
+    return kind(*arrays)
+
+
 def _padded(n: int, step: int) -> int:
     return -(-n // step) * step
 
 
-def _chain(kept: list[int], motion: Motion) -> tuple[Chain, dict[int, int]]:
+def _chain(kept: list[int], motion: Motion) -> tuple[Any, dict[int, int]]:
     """The pruned chain, padded to a multiple of four joints, and the place of each skeleton joint in it."""
     top = motion.skeleton.topology
     new = {j: i for i, j in enumerate(kept)}
@@ -345,13 +424,13 @@ def _chain(kept: list[int], motion: Motion) -> tuple[Chain, dict[int, int]]:
     if motion.skeleton.limits is not None:
         limits = np.tile(np.array([-np.pi, np.pi]) * 4, (p, 3, 1))
         limits[: len(kept)] = np.asarray(motion.skeleton.limits, float)[kept]
-    return Chain(parents, above, limits), new
+    return _laid(Chain, parents, above, limits), new
 
 
 SIZES = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 28, 32)
 
 
-def _arrays(asked, layer, count, kept, new, chain, body, settings) -> tuple[Tasks, Frames]:
+def _arrays(asked, layer, count, kept, new, chain, body, settings) -> tuple[Any, Any]:
     """Tasks and frames, padded: constraints to one of `SIZES`, mass points to a multiple of four."""
     f, p, n = body.frames, len(chain.parents), len(asked)
     b = next((s for s in SIZES if s >= n), _padded(n, 8))
@@ -375,13 +454,14 @@ def _arrays(asked, layer, count, kept, new, chain, body, settings) -> tuple[Task
     centers = [i for i, a in enumerate(asked) if a.kind == CENTER_OF_MASS]
     mass_joint, mass_point, weights = _mass_points([asked[i] for i in centers], kept, new, body)
     carried = weights[:, None, :] * chain.above[mass_joint].T[None]
-    tasks = Tasks(
+    tasks = _laid(
+        Tasks,
         kind, joint, reference, point, look, scale, layers, recruits, root, above, beside,
         np.array(centers, np.int32), mass_joint, weights, carried,
     )  # fmt: skip
     used = np.einsum("fb,bp->fp", active, recruits) > 0
     used_root = (active @ root) > 0
-    return tasks, _frames(kept, p, body, used, used_root, Goals(place, rotation, active, mass_point, np.ones(f)))
+    return tasks, _frames(kept, p, body, used, used_root, _laid(Goals, place, rotation, active, mass_point, np.ones(f)))
 
 
 def _mass_points(asked, kept, new, body):
@@ -415,7 +495,7 @@ def _mass_points(asked, kept, new, body):
     return joint, place, weights
 
 
-def _frames(kept, p, body, used, used_root, goals) -> Frames:
+def _frames(kept, p, body, used, used_root, goals) -> Any:
     """The input along the chain."""
     f, n = body.frames, len(kept)
     motion, top = body.motion, body.top
@@ -430,4 +510,4 @@ def _frames(kept, p, body, used, used_root, goals) -> Frames:
             root = path - body.origin
         elif j in kept:
             offsets[:, kept.index(j)] = path
-    return Frames(rotation, root, offsets, used.astype(float), used_root.astype(float), np.ones(f), goals)
+    return _laid(Frames, rotation, root, offsets, used.astype(float), used_root.astype(float), np.ones(f), goals)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from ..numerics import eps_of, safe_divide, safe_sqrt
 
@@ -148,9 +148,10 @@ def layered_step(
 ) -> Float[Array, "m *c"]:
     """Coordinates `y` of the step in the row basis: `dm = y Q`. Those of a layer do not depend on the layers below it.
 
-    residual: what each row should still move by, of one trial or of several (last axis). block: ones where two rows belong to one constraint; a constraint asks for
-    `clamp` at most (one number, or one a row). budget: the longest step in all, spent in order of priority (cutting the whole step would let a lower
-    layer's long step shrink a higher one's). drag: whether the drag of `factorize` takes part.
+    residual: what each row should still move by, of one trial or of several (last axis). block: ones where two rows belong
+    to one constraint; a constraint asks for `clamp` at most (one number, or one a row). budget: the longest step in all,
+    spent in order of priority (cutting the whole step would let a lower layer's long step shrink a higher one's). drag:
+    whether the drag of `factorize` takes part.
     """
     rest = factors.rest if drag else jnp.zeros_like(factors.rest)
 

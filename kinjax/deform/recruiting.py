@@ -35,7 +35,7 @@ def recruited(goal: Goal, top: Topology, title: str) -> frozenset[int]:
     if isinstance(goal, CenterOfMass):
         if goal.recruit_to is not None:
             raise OptionError(f"{title}: a centre of mass has no chain: list its joints in recruits")
-        return frozenset((0,))
+        return frozenset(range(len(top.names)))
     joint = top.index(goal.joint)
     chain = chain_of(top, joint)
     if goal.recruit_to is not None:
@@ -55,23 +55,27 @@ def check_rule(
     titles: Sequence[str],
     priorities: Sequence[float],
     sets: Sequence[frozenset[int]],
+    moves: Sequence[frozenset[int]],
     active: np.ndarray,
     top: Topology,
 ) -> None:
-    """The recruiting rule: where two constraints share more than one joint at one time, the more important one must recruit
-    all that the other recruits. active: (F, B)."""
+    """The recruiting rule (eq. 2): where two constraints share joints at one time, the more important one must recruit all that
+    the other recruits; else the other moves it behind its back.
+
+    Asked only of the joints that can move the more important constraint (`moves`): the arms that a centre of mass recruits
+    cannot disturb a foot above it. active: (F, B).
+    """
     for a, b in combinations(range(len(titles)), 2):
         if priorities[a] == priorities[b]:
             continue
         if priorities[a] < priorities[b]:
             a, b = b, a
-        missing = sets[b] - sets[a]
-        if len(sets[a] & sets[b]) > 1 and missing and (active[:, a] & active[:, b]).any():
+        missing = (sets[b] - sets[a]) & moves[a]
+        if missing and (active[:, a] & active[:, b]).any():
             raise OptionError(
-                f"recruiting rule: {titles[b]} (priority {priorities[b]:g}) shares "
-                f"{_some(sets[a] & sets[b], top)} with {titles[a]} (priority {priorities[a]:g}), which does not recruit "
-                f"{_some(missing, top)}; give {titles[a]} these joints too (recruits), end the chain of {titles[b]} "
-                "earlier (recruit_to), or give both one priority"
+                f"recruiting rule: {titles[b]} (priority {priorities[b]:g}) recruits {_some(missing, top)}, which "
+                f"{titles[a]} (priority {priorities[a]:g}) depends on but does not recruit; give {titles[a]} these joints too "
+                f"(recruits), end the chain of {titles[b]} earlier (recruit_to), or give both one priority"
             )
 
 

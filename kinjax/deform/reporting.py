@@ -6,13 +6,14 @@ motion by its own kinematics, on the host.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
 from ..motion import Motion
-from .plan import Body, Plan
+from .plan import Body, Plan, filled
 from .results import CONFLICT, CONVERGED, FREE, MAX_ITER, NONFINITE, STALLED, UNREACHABLE, Report
-from .sequence import Solved
 from .settings import Settings
 from .targets import rotations
 from .tasks import CENTER_OF_MASS, LOOK_AT, ORIENTATION, RADIAN
@@ -23,27 +24,26 @@ BLOCKED = 0.03
 
 def residual_table(motion: Motion, plan: Plan) -> Float[np.ndarray, "f b"]:
     """Distance (m) or angle (rad) that each of the plan's constraints, in the plan's order, is off; NaN where not active."""
-    body = Body(motion)
-    body.position = body.position + (body.origin - plan.origin)
+    body = Body(motion, plan.origin)
     tasks, goals = plan.tasks, plan.frames.goals
     out = np.full((motion.frames, len(plan.order)), np.nan)
     for b in range(len(plan.order)):
         joint = int(plan.kept[tasks.joint[b]])
         world = tasks.reference[b] == len(plan.chain.parents)
-        back = None if world else rotations(_rotation(body, int(plan.kept[tasks.reference[b]]))).inv()
-        origin = 0.0 if world else body.position[:, int(plan.kept[tasks.reference[b]])]
+        back = None if world else rotations(filled(body.turn(int(plan.kept[tasks.reference[b]])))).inv()
+        origin = 0.0 if world else body.place(int(plan.kept[tasks.reference[b]]))
         axes = tasks.scale[b] > 0
-        seen = rotations(_rotation(body, joint))
+        seen = rotations(filled(body.turn(joint)))
         if tasks.kind[b] == ORIENTATION:
             own = seen if back is None else back * seen
-            goal = rotations(_finite(goals.rotation[:, b]))
+            goal = rotations(filled(goals.rotation[:, b]))
             off = (goal * own.inv()).as_rotvec() * axes
             value = np.linalg.norm(off, axis=1)
         else:
             point = (
                 _center(body, plan, b)
                 if tasks.kind[b] == CENTER_OF_MASS
-                else body.position[:, joint] + seen.apply(tasks.point[b])
+                else body.place(joint) + seen.apply(tasks.point[b])
             )
             place = point - origin if back is None else back.apply(point - origin)
             away = goals.place[:, b] - place
@@ -53,21 +53,9 @@ def residual_table(motion: Motion, plan: Plan) -> Float[np.ndarray, "f b"]:
                 value = np.arctan2(np.linalg.norm(np.cross(along, away), axis=1), (along * away).sum(1))
             else:
                 value = np.linalg.norm(away * axes, axis=1)
-        lost = (
-            ~np.isfinite(body.rotation[:, joint]).all(1)
-            | ~np.isfinite(goals.place[:, b]).all(1)
-            | ~np.isfinite(goals.rotation[:, b]).all(1)
-        )
+        lost = body.lost(joint) | ~np.isfinite(goals.place[:, b]).all(1) | ~np.isfinite(goals.rotation[:, b]).all(1)
         out[:, b] = np.where((goals.active[:, b] > 0) & ~lost, value, np.nan)
     return out
-
-
-def _rotation(body: Body, joint: int) -> np.ndarray:
-    return _finite(body.rotation[:, joint])
-
-
-def _finite(q: np.ndarray) -> np.ndarray:
-    return np.where(np.isfinite(q).all(-1, keepdims=True), q, np.array([1.0, 0, 0, 0]))
 
 
 def _center(body: Body, plan: Plan, b: int) -> np.ndarray:
@@ -76,11 +64,11 @@ def _center(body: Body, plan: Plan, b: int) -> np.ndarray:
     d = list(plan.tasks.centers).index(b)
     weights = plan.tasks.weights[d]
     for m in np.flatnonzero(weights < 0):
-        center = center + weights[m] * body.position[:, int(plan.kept[plan.tasks.mass_joint[m]])]
+        center = center + weights[m] * body.place(int(plan.kept[plan.tasks.mass_joint[m]]))
     return center
 
 
-def status_table(residual: np.ndarray, plan: Plan, solved: Solved, settings: Settings) -> np.ndarray:
+def status_table(residual: np.ndarray, plan: Plan, solved: Any, settings: Settings) -> np.ndarray:
     """(F, B) indices into `STATUSES`, in the plan's order."""
     n = len(plan.order)
     active = plan.frames.goals.active[:, :n] > 0
@@ -96,7 +84,7 @@ def status_table(residual: np.ndarray, plan: Plan, solved: Solved, settings: Set
     return np.where(active, status, FREE).astype(int)
 
 
-def make_report(before: Motion, after: Motion, plan: Plan, solved: Solved, settings: Settings, passes: int) -> Report:
+def make_report(before: Motion, after: Motion, plan: Plan, solved: Any, settings: Settings, passes: int) -> Report:
     """The report of a finished deformation, in the order in which the caller gave the constraints."""
     table = residual_table(after, plan)
     status = status_table(table, plan, solved, settings)
@@ -106,7 +94,7 @@ def make_report(before: Motion, after: Motion, plan: Plan, solved: Solved, setti
     code[:, list(plan.order)] = status
     q0, q1 = np.asarray(before.rotations, float), np.asarray(after.rotations, float)
     joints = q0.shape[1]
-    turn = rotations(_finite(q1.reshape(-1, 4))) * rotations(_finite(q0.reshape(-1, 4))).inv()
+    turn = rotations(filled(q1.reshape(-1, 4))) * rotations(filled(q0.reshape(-1, 4))).inv()
     change = turn.magnitude().reshape(f, joints)
     change[~(np.isfinite(q0).all(-1) & np.isfinite(q1).all(-1))] = np.nan
     top = before.skeleton.topology

@@ -32,10 +32,10 @@ def signatures(plan: Plan) -> list[bytes]:
     out = []
     for f in range(len(plan.frames.root)):
         digest = hashlib.blake2b(digest_size=16)
-        last = -1
-        for b in np.flatnonzero(goals.active[f, :count]):
+        last: int = -1
+        for b in map(int, np.flatnonzero(goals.active[f, :count])):
             digest.update(b"same" if tasks.layer[b] == last else b"next")
-            last = tasks.layer[b]
+            last = int(tasks.layer[b])
             digest.update(fixed[b])
             digest.update((goals.rotation if tasks.kind[b] == ORIENTATION else goals.place)[f, b].tobytes())
         out.append(digest.digest())

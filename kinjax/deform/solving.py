@@ -14,7 +14,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
 
 from .chain import Pose
 from .frame_solver import Solving
@@ -37,18 +36,21 @@ class Run:
 
     plan: Plan
     asked: list[bytes]
-    frames: Frames
-    solved: Solved
+    frames: Any
+    solved: Any
 
 
 @partial(jax.jit, static_argnames=("layers", "kinds", "attract"))
 def _solve(*args: Any, layers: int, kinds: Kinds, attract: tuple[bool, bool]) -> tuple[Carried, Solved]:
-    return solve_sequence(*args, layers=layers, kinds=kinds, attract=attract)
+    chain, tasks, frames, first, solving = args
+    return solve_sequence(chain, tasks, frames, first, solving, layers, kinds, attract)
 
 
 @partial(jax.jit, static_argnames=("layers", "kinds", "attract"))
 def _solve_many(*args: Any, layers: int, kinds: Kinds, attract: tuple[bool, bool]) -> tuple[Carried, Solved]:
-    one = partial(solve_sequence, layers=layers, kinds=kinds, attract=attract)
+    def one(chain: Any, tasks: Any, frames: Any, first: Any, solving: Any) -> tuple[Carried, Solved]:
+        return solve_sequence(chain, tasks, frames, first, solving, layers, kinds, attract)
+
     return jax.vmap(one, in_axes=(0, 0, 0, 0, None))(*args)
 
 
@@ -63,7 +65,7 @@ def solve(
     count = len(frames.root)
     same = _unchanged(frames, asked, plan, old)
     pose = _begin(cast.rotations[0], cast.root[0], plan.layers)
-    out: list[Solved] = []
+    out: list[Any] = []
     linked = True  # the pose that enters this piece is the one that entered it in the old run
     for begin in range(0, count, PIECE):
         end = min(begin + PIECE, count)
@@ -79,7 +81,7 @@ def solve(
     return Run(plan, asked, frames, jax.tree.map(lambda *x: np.concatenate(x), *out))
 
 
-def solve_many(plans: Sequence[Plan], settings: Settings, tell: Callable[[int], None]) -> list[Solved]:
+def solve_many(plans: Sequence[Plan], settings: Settings, tell: Callable[[int], None]) -> list[Any]:
     """Several clips side by side; their plans have arrays of the same shapes (frames apart)."""
     dtype = np.dtype(settings.precision)
     static = {"layers": plans[0].layers, "kinds": plans[0].kinds, "attract": (settings.attract, settings.attract_root)}
@@ -90,7 +92,7 @@ def solve_many(plans: Sequence[Plan], settings: Settings, tell: Callable[[int], 
     )
     counts = [len(p.frames.root) for p in plans]
     pose = _stack([_begin(f.rotations[0], f.root[0], plans[0].layers) for f in cast])
-    out: list[Solved] = []
+    out: list[Any] = []
     for begin in range(0, max(counts), PIECE):
         pieces = _stack(
             [_piece(f, min(begin, n - 1), min(begin + PIECE, n), begin >= n) for f, n in zip(cast, counts, strict=True)]
@@ -103,7 +105,10 @@ def solve_many(plans: Sequence[Plan], settings: Settings, tell: Callable[[int], 
 
 
 def _solving(settings: Settings, dtype: np.dtype) -> Solving:
-    return Solving(*(np.asarray(getattr(settings, n), dtype) for n in Solving._fields))
+    values: Any = [
+        np.asarray(getattr(settings, n), np.int32 if n == "iterations" else dtype) for n in Solving._fields
+    ]
+    return Solving(*values)
 
 
 def _cast(tree: Any, dtype: np.dtype) -> Any:
@@ -117,10 +122,12 @@ def _stack(trees: Sequence[Any]) -> Any:
 def _begin(rotations: np.ndarray, root: np.ndarray, layers: int) -> Any:
     """What the first frame starts from; parts of it that are not finite begin at rest."""
     q = np.where(np.isfinite(rotations).all(0), rotations, np.eye(4, 1, dtype=rotations.dtype))
-    return Carried(Pose(q[..., None], np.where(np.isfinite(root), root, 0)[:, None]), np.ones(layers, root.dtype))
+    pose: Any = q[..., None], np.where(np.isfinite(root), root, 0)[:, None]
+    trust: Any = np.ones(layers, root.dtype)
+    return Carried(Pose(*pose), trust)
 
 
-def _piece(frames: Frames, begin: int, end: int, empty: bool = False) -> Frames:
+def _piece(frames: Any, begin: int, end: int, empty: bool = False) -> Any:
     """Frames `begin..end-1` filled up to `PIECE` with copies of the last, of which nothing is asked (of none, if `empty`)."""
     piece = jax.tree.map(lambda x: x[begin:end], frames)
     more = PIECE - (end - begin)
@@ -133,7 +140,7 @@ def _piece(frames: Frames, begin: int, end: int, empty: bool = False) -> Frames:
     return piece
 
 
-def _last(piece: Solved, before: Any) -> Any:
+def _last(piece: Any, before: Any) -> Any:
     """What the frame after a piece starts from: the last finite pose, and the trust."""
     known = np.isfinite(piece.rotations).all((1, 2)) & np.isfinite(piece.root).all(1)
     if not known.any():
@@ -142,7 +149,7 @@ def _last(piece: Solved, before: Any) -> Any:
     return Carried(Pose(piece.rotations[at][..., None], piece.root[at][:, None]), piece.trust[-1])
 
 
-def _unchanged(frames: Frames, asked: list[bytes], plan: Plan, old: Run | None) -> np.ndarray:
+def _unchanged(frames: Any, asked: list[bytes], plan: Plan, old: Run | None) -> np.ndarray:
     """(F,) the frames of which the same is asked as in the old run, from the same start."""
     if old is None or len(asked) != len(old.asked):
         return np.zeros(len(asked), bool)
@@ -159,7 +166,7 @@ def _shared(a: Plan, b: Plan) -> tuple[np.ndarray, np.ndarray]:
     return np.flatnonzero(np.isin(a.kept, b.kept)), np.flatnonzero(np.isin(b.kept, a.kept))
 
 
-def _taken(old: Run, plan: Plan, begin: int, end: int) -> Solved:
+def _taken(old: Run, plan: Plan, begin: int, end: int) -> Any:
     """Frames `begin..end-1` of an old run in the order of this plan's chain and constraints.
 
     Joints that only this plan has are not controlled in these frames, and are the input's. The constraints that are active
