@@ -26,7 +26,7 @@ from ..numerics import safe_divide, safe_sqrt
 from ..rotations import log
 from .chain import Chain, Pose, World, compose, forward, inverse_of, moved, parent_rotations
 from .prioritized import factorize, layered_step, outside, times
-from .tasks import Goals, Kinds, Tasks, jacobian, look, residuals
+from .tasks import CENTER_OF_MASS, Goals, Kinds, Tasks, jacobian, look, residuals
 
 
 class Solving(NamedTuple):
@@ -166,6 +166,7 @@ class _Iteration:
         self.chain, self.tasks, self.goals, self.offsets = chain, tasks, goals, offsets
         self.reference, self.layers, self.solving, self.kinds = reference, layers, solving, kinds
         self.rows = jnp.repeat(tasks.layer, 3)
+        self.limbs = jnp.repeat(tasks.kind, 3) != CENTER_OF_MASS  # a centre of mass has no joint that snaps
         self.members = (self.rows[None, :] == jnp.arange(layers, dtype=jnp.int32)[:, None]).astype(offsets.dtype)
         self.block = jnp.kron(jnp.eye(tasks.kind.shape[0], dtype=offsets.dtype), jnp.ones((3, 3), offsets.dtype))
 
@@ -203,7 +204,7 @@ class _Iteration:
         r0 = s.residual.reshape(-1) * counts
         jac = jacobian(self.chain, self.tasks, self.goals, s.world, seen, self.kinds) * counts[:, None]
         damping = solving.damping * jnp.minimum(1, (members.T @ s.errors) / solving.damped_error)
-        held = jnp.where(rows == depth - 1, solving.drag, 0.0).astype(jac.dtype)
+        held = jnp.where((rows == depth - 1) & self.limbs, solving.drag, 0.0).astype(jac.dtype)
         factors = factorize(jac, rows, damping, (held, solving.singular), s.travel)
         across = factors.basis.rows
         correct = partial(layered_step, factors, layer=rows, layers=layers, block=self.block, budget=solving.budget)
