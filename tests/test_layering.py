@@ -23,7 +23,7 @@ DETECT = (
     "merging",
 )  # fmt: skip
 STRANGERS = ({"detect", "deform"}, {"studio", "cli"}, {"plots", "database"})
-CLI = ("cache", "options", "parse", "show", "request", "detecting", "pictures", "commands", "demo")
+CLI = ("cache", "options", "parse", "show", "request", "detecting", "deforming", "pictures", "commands", "demo")
 
 FILES = sorted(PACKAGE.rglob("*.py"))
 

@@ -10,6 +10,7 @@ import os
 from pathlib import Path
 
 OFF = ("off", "0", "no", "none")
+FAST_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000"
 
 
 def use_cache() -> Path | None:
@@ -34,3 +35,13 @@ def use_cache() -> Path | None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     return folder
+
+
+def use_fast_loops() -> None:
+    """Have XLA run small loops on the CPU in one thread each: the frame loop of a deformation is up to twice as fast.
+
+    XLA reads this once, so it goes before JAX. Only for commands that deform; what the user has set stays.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "xla_backend_extra_options" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {FAST_LOOPS}".strip()

@@ -124,6 +124,66 @@ class Plot(Reading, Detecting):
 
 
 @dataclass(frozen=True)
+class Deforming:
+    """How a motion is bent, and what is written."""
+
+    output: Annotated[Path | None, _opt("-o", metavar="FILE")] = None
+    """Where the motion goes: .bvh (the hierarchy and channels of a BVH clip are kept) or .npz."""
+    report: Annotated[Path | None, _opt(metavar="FILE", default="none")] = None
+    """Also write the report on every constraint and frame (JSON)."""
+    iterations: Annotated[int | None, _opt(metavar="N", default="10")] = None
+    """Iterations of the solver a frame, at most."""
+    precision: Annotated[Literal["float64", "float32"] | None, _opt(metavar="{float64,float32}", default="float64")] = None
+    """Precision of the solver."""
+    solver: Annotated[UseAppendAction[tuple[str, ...]], _opt(metavar="NAME=VALUE", default="none")] = ()
+    """Any other setting of kinjax.deform.Settings, as filter_root=6 or strategy=weights; repeatable."""
+    quiet: Annotated[bool, _opt("-q")] = False
+    """Print no tables, only warnings and errors."""
+
+
+@dataclass(frozen=True)
+class Deform(Reading, Deforming):
+    """Bend a motion to the constraints of an edit file (docs/edit-files.md)."""
+
+    clip: Positional[Annotated[Path | None, _opt(metavar="CLIP")]] = None
+    """A motion file."""
+    edit: Positional[Annotated[Path | None, _opt(metavar="EDIT.toml")]] = None
+    """The constraints, and settings if it likes; options here come before those."""
+
+    def run(self) -> int:
+        """Do it."""
+        from .cache import use_fast_loops
+
+        use_fast_loops()  # before anything imports JAX
+        from .deforming import deform_command
+
+        return deform_command(self)
+
+
+@dataclass(frozen=True)
+class Clean(Reading, Deforming, Detecting):
+    """Make planted feet stand still: find the constraints of a motion, and keep them."""
+
+    clip: Positional[Annotated[Path | None, _opt(metavar="CLIP")]] = None
+    """A motion file."""
+    object: Annotated[UseAppendAction[tuple[tuple[str, ...], ...]], _opt(metavar="NAME [NAME ...]", default="feet, by name")] = ()
+    """Joints whose constraints are kept, in any case; an unknown one lists the nearest."""
+    annotations: Annotated[Path | None, _opt(metavar="FILE", default="none: they are detected")] = None
+    """Keep the constraints that were found earlier (.json, .csv, .parquet, .npz); --object and --type choose among them."""
+    ease: Annotated[float, _opt(metavar="SECONDS", default="0.1")] = 0.1
+    """How long a foot takes to its held place, and back to its own path."""
+
+    def run(self) -> int:
+        """Do it."""
+        from .cache import use_fast_loops
+
+        use_fast_loops()  # before anything imports JAX
+        from .deforming import clean_command
+
+        return clean_command(self)
+
+
+@dataclass(frozen=True)
 class Info(Reading):
     """Show a clip's frames, rate, duration, unit, and its joints as a tree."""
 
@@ -185,6 +245,8 @@ class Demo:
 
 Command = (
     Annotated[Detect, subcommand("detect")]
+    | Annotated[Deform, subcommand("deform")]
+    | Annotated[Clean, subcommand("clean")]
     | Annotated[Info, subcommand("info")]
     | Annotated[Plot, subcommand("plot")]
     | Annotated[Report, subcommand("report")]
@@ -192,4 +254,4 @@ Command = (
     | Annotated[Samples, subcommand("samples")]
     | Annotated[Demo, subcommand("demo")]
 )
-NAMES = ("detect", "info", "plot", "report", "export", "samples", "demo")
+NAMES = ("detect", "deform", "clean", "info", "plot", "report", "export", "samples", "demo")
