@@ -169,6 +169,17 @@ def counts_at(words: Bits, index: Int[Array, "lanes k"]) -> Int[Array, "lanes k"
     return jnp.take_along_axis(before, block, axis=1) + own
 
 
+def computed_once(x: Any, never: Bool[Array, ""]) -> Any:
+    """`x`, which is computed before anything reads it: else XLA computes it again inside each of its readers. (It removes
+    optimization barriers on the CPU before it fuses.) `never` is a value that is False, which the compiler cannot know:
+    what carries `x` is a loop that does not run."""
+
+    def again(carried: Any) -> Any:
+        return jax.tree.map(lambda y: jnp.roll(y, 1), carried[0]), carried[1]
+
+    return jax.lax.while_loop(lambda carried: carried[1], again, (x, never))[0]
+
+
 CHUNK = 32
 """Rows that `in_chunks` takes at once."""
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..kinematics import world_transforms
-from ..numerics import BLOCK, packed_bits
+from ..numerics import BLOCK, computed_once, packed_bits
 from ..rotations import cross, normalize, rotate
 from . import noise
 from .displacements import Displacement, displacements, mean_pose, spikes
@@ -35,9 +35,12 @@ def run(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, give
     paper = plan.method == "paper"
     q, t, seen = clip
     # component by component, here and in what follows: XLA does not vectorise a loop over a stack of them
-    q = jnp.stack([jnp.where(seen, x, 0 if i else 1) for i, x in enumerate(normalize(q))])
-    t = jnp.stack([jnp.where(seen, x, 0) for x in t])
-    valid = seen if paper else seen & ~spikes(q, t, seen, plan.hampel, numbers.spike)
+    turned = [jnp.where(seen, x, 0 if i else 1) for i, x in enumerate(normalize(q))]
+    moved = [jnp.where(seen, x, 0) for x in t]
+    never = numbers.rate < 0
+    turned, moved, seen = computed_once((turned, moved, seen), never)
+    q, t = jnp.stack(turned), jnp.stack(moved)
+    valid = seen if paper else seen & ~spikes(q, t, seen, plan.hampel, numbers.spike, never)
     clip = Clip(q, t, valid)
     smooth = clip if paper else Clip(*mean_pose(q, t, valid, plan.mean), valid)
     nu = (jnp.zeros_like(t[0, :, 0]),) * 2 if paper else noise.data_noise(q, t, valid)
@@ -58,6 +61,7 @@ def run(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, give
         limits[-1] if paper and plan.lines else None,
         numbers.axis_min,
     )
+    points, passed = computed_once((points, passed), never)
     if plan.method == "window":
         total, spans = _rest_windows(plan, numbers, clip, nu, templates)
     else:

@@ -149,12 +149,46 @@ def elements(
 
 
 def merge(find: Find, total: Int[Array, " objects"], capacity: int, tolerance: Tolerance, lines: bool) -> Spans:
-    """The pass in time order: each element joins the open constraint or closes it. `lines=False` drops what only lines need.
+    """The pass in time order: each element joins the open constraint or closes it. `lines=False`: all are space.
 
     Of more than `capacity` elements the first ones.
     """
-    (objects,), dtype = total.shape, tolerance.max_jump.dtype
-    zero3 = jnp.zeros((3, objects), dtype)
+    most = jnp.max(total, initial=0)
+    return (_merged_in_order if lines else _merged_rests)(find, most, total.shape[0], capacity, tolerance)
+
+
+def _merged_rests(find: Find, most: Int[Array, ""], objects: int, capacity: int, tolerance: Tolerance) -> Spans:
+    """Rests only: whether one joins the rest before it depends on these two alone, so nothing has to wait for anything."""
+    zero = jnp.zeros((1, objects), jnp.int32)
+
+    def chunk(before: tuple[Array, ...], first: Int[Array, ""]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        items = find(first, CHUNK)
+        new = items.kind, items.fails[1], items.gone[1], *items.stop
+        kind, fails, gone, *at = (jnp.concatenate([b, x[:-1]]) for b, x in zip(before, new, strict=True))
+        gap = items.fails[0] - fails
+        distance = safe_norm(items.start - jnp.stack(at), axis=0)
+        joins = (kind != NONE) & (items.gone[0] - gone <= tolerance.max_missing) & (distance <= tolerance.max_jump)
+        joins &= gap <= frame_tolerance(distance, tolerance.max_gap, tolerance.max_jump)
+        return tuple(x[-1:] for x in new), (items.kind != NONE, joins, items.first, items.last)
+
+    start = (zero, zero, zero, *(jnp.zeros((1, objects), tolerance.max_jump.dtype),) * 3)
+    real, joins, first, last = in_chunks(chunk, start, capacity, most)[1]
+    follows = jnp.concatenate([(real & joins)[1:], jnp.zeros((1, objects), bool)])
+    begins, ends = packed_bits((real & ~joins).T), packed_bits((real & ~follows).T)
+
+    def pick(state: None, at: Int[Array, ""]) -> tuple[None, Spans]:
+        (begin, total), (end, _) = true_positions(begins, CHUNK, at), true_positions(ends, CHUNK, at)
+        begin, end = (jnp.minimum(x, capacity - 1).T for x in (begin, end))
+        used = (at + jnp.arange(CHUNK, dtype=jnp.int32))[:, None] < total
+        span = (jnp.take_along_axis(x, i, axis=0) for x, i in ((first, begin), (last, end)))
+        return state, Spans(jnp.where(used, SPACE, NONE), *span)
+
+    return in_chunks(pick, None, capacity, most)[1]
+
+
+def _merged_in_order(find: Find, most: Int[Array, ""], objects: int, capacity: int, tolerance: Tolerance) -> Spans:
+    """Lines among them: what a constraint has become decides what joins it."""
+    zero3 = jnp.zeros((3, objects), tolerance.max_jump.dtype)
     zero = jnp.zeros(objects, jnp.int32)
 
     def step(open_: Any, new: Any) -> tuple[Any, Any]:
@@ -166,24 +200,22 @@ def merge(find: Find, total: Int[Array, " objects"], capacity: int, tolerance: T
         distance = safe_norm(apart, axis=0)
         reach = gap <= frame_tolerance(distance, tolerance.max_gap, tolerance.max_jump)
         joins = (kind == SPACE) & (n_kind == SPACE) & reach & (distance <= tolerance.max_jump)
-        becomes, point = jnp.full_like(kind, SPACE), n_stop
-        if lines:
-            normal = cross(axis, n_axis)
-            sine = safe_norm(normal, axis=0)
-            parallel = jnp.arctan2(sine, jnp.abs(dot(axis, n_axis))) < tolerance.alpha_max
-            beside = safe_norm(cross(apart, axis), axis=0)
-            skew = jnp.abs(safe_divide(dot(apart, normal), sine))
-            # feet of the common perpendicular of two lines that are not parallel
-            s = safe_divide(dot(cross(apart, n_axis), normal), sine**2)
-            u = safe_divide(dot(cross(apart, axis), normal), sine**2)
-            crossing = (at + s * axis + n_start + u * n_axis) / 2
-            from_point = safe_norm(cross(apart, n_axis), axis=0)
-            d = jnp.where(kind == POINT, from_point, jnp.where(parallel, beside, skew))
-            near = (d <= tolerance.dist_max) & (gap <= frame_tolerance(d, tolerance.max_gap, tolerance.max_jump))
-            joins |= ((kind == LINE) | (kind == POINT)) & (n_kind == LINE) & near
-            meets = (kind == POINT) | ((kind == LINE) & ~parallel)
-            becomes = jnp.where(n_kind == SPACE, SPACE, jnp.where(meets, POINT, LINE))
-            point = jnp.where(kind == POINT, at, jnp.where((n_kind == LINE) & meets, crossing, n_stop))
+        normal = cross(axis, n_axis)
+        sine = safe_norm(normal, axis=0)
+        parallel = jnp.arctan2(sine, jnp.abs(dot(axis, n_axis))) < tolerance.alpha_max
+        beside = safe_norm(cross(apart, axis), axis=0)
+        skew = jnp.abs(safe_divide(dot(apart, normal), sine))
+        # feet of the common perpendicular of two lines that are not parallel
+        s = safe_divide(dot(cross(apart, n_axis), normal), sine**2)
+        u = safe_divide(dot(cross(apart, axis), normal), sine**2)
+        crossing = (at + s * axis + n_start + u * n_axis) / 2
+        from_point = safe_norm(cross(apart, n_axis), axis=0)
+        d = jnp.where(kind == POINT, from_point, jnp.where(parallel, beside, skew))
+        near = (d <= tolerance.dist_max) & (gap <= frame_tolerance(d, tolerance.max_gap, tolerance.max_jump))
+        joins |= ((kind == LINE) | (kind == POINT)) & (n_kind == LINE) & near
+        meets = (kind == POINT) | ((kind == LINE) & ~parallel)
+        becomes = jnp.where(n_kind == SPACE, SPACE, jnp.where(meets, POINT, LINE))
+        point = jnp.where(kind == POINT, at, jnp.where((n_kind == LINE) & meets, crossing, n_stop))
         joins &= connected
         real = n_kind != NONE
         closes = real & ~joins
@@ -205,7 +237,6 @@ def merge(find: Find, total: Int[Array, " objects"], capacity: int, tolerance: T
         return jax.lax.scan(step, state, along)
 
     start = (jnp.full_like(zero, NONE), zero, zero, zero3, zero3, zero, zero)
-    most = jnp.max(total, initial=0)
     state, out = in_chunks(chunk, start, capacity, most)
     return packed(Spans(*(jnp.concatenate([o, s[None]]) for o, s in zip(out, state[:3], strict=True))), most)
 
