@@ -163,15 +163,15 @@ def _merged_rests(find: Find, most: Int[Array, ""], objects: int, capacity: int,
 
     def chunk(before: tuple[Array, ...], first: Int[Array, ""]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         items = find(first, CHUNK)
-        new = items.kind, items.fails[1], items.gone[1], *items.stop
-        kind, fails, gone, *at = (jnp.concatenate([b, x[:-1]]) for b, x in zip(before, new, strict=True))
+        new = items.kind != NONE, items.fails[1], items.gone[1], *items.stop
+        some, fails, gone, *at = (jnp.concatenate([b, x[:-1]]) for b, x in zip(before, new, strict=True))
         gap = items.fails[0] - fails
         distance = safe_norm(items.start - jnp.stack(at), axis=0)
-        joins = (kind != NONE) & (items.gone[0] - gone <= tolerance.max_missing) & (distance <= tolerance.max_jump)
+        joins = some & (items.gone[0] - gone <= tolerance.max_missing) & (distance <= tolerance.max_jump)
         joins &= gap <= frame_tolerance(distance, tolerance.max_gap, tolerance.max_jump)
-        return tuple(x[-1:] for x in new), (items.kind != NONE, joins, items.first, items.last)
+        return tuple(x[-1:] for x in new), (new[0], joins, items.first, items.last)
 
-    start = (zero, zero, zero, *(jnp.zeros((1, objects), tolerance.max_jump.dtype),) * 3)
+    start = (zero > 0, zero, zero, *(jnp.zeros((1, objects), tolerance.max_jump.dtype),) * 3)
     real, joins, first, last = in_chunks(chunk, start, capacity, most)[1]
     follows = jnp.concatenate([(real & joins)[1:], jnp.zeros((1, objects), bool)])
     begins, ends = packed_bits((real & ~joins).T), packed_bits((real & ~follows).T)
@@ -181,7 +181,7 @@ def _merged_rests(find: Find, most: Int[Array, ""], objects: int, capacity: int,
         begin, end = (jnp.minimum(x, capacity - 1).T for x in (begin, end))
         used = (at + jnp.arange(CHUNK, dtype=jnp.int32))[:, None] < total
         span = (jnp.take_along_axis(x, i, axis=0) for x, i in ((first, begin), (last, end)))
-        return state, Spans(jnp.where(used, SPACE, NONE), *span)
+        return state, Spans(jnp.where(used, jnp.int32(SPACE), jnp.int32(NONE)), *span)
 
     return in_chunks(pick, None, capacity, most)[1]
 
