@@ -73,9 +73,10 @@ def normalize(q: Quaternion) -> Quaternion:
     """Unit quaternion; zero and non-finite ones become the identity (their frames are masked)."""
     n2 = dot(q, q)
     good = (n2 > 0) & jnp.isfinite(n2)
-    scale = 1 / safe_sqrt(jnp.where(good, n2, 1))
     # component by component: what selects on a stack of them does not vectorise
-    return jnp.stack([jnp.where(good, x * scale, 0 if i else 1) for i, x in enumerate(q)])
+    parts = [jnp.where(good, x, 0 if i else 1) for i, x in enumerate(q)]
+    scale = 1 / safe_sqrt(dot(parts, parts))
+    return jnp.stack([x * scale for x in parts])
 
 
 def matrix(q: Quaternion) -> Float[Array, "3 3 ..."]:
