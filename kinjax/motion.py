@@ -170,6 +170,59 @@ def make_poses(
     return Poses(rotation=rotation, position=position, valid=finite, rate=rate, names=tuple(names), clip=clip, up=up)
 
 
+def resample(motion: Motion, rate: float) -> Motion:
+    """The clip at another rate, frame 0 at its time: translations linear in between, rotations along the shorter arc (slerp).
+
+    The last frame is the last one of the new rate inside the clip; a rest of the clip after it is told in `notes`. Frames that
+    are not finite spoil those interpolated from them, and no others.
+    """
+    if not (np.isfinite(rate) and rate > 0):
+        raise OptionError(f"rate is {rate}: it must be a positive number of frames a second")
+    count, old = motion.frames, float(motion.rate)
+    if count < 1 or not (np.isfinite(old) and old > 0):
+        raise ShapeError(
+            f"{motion.name or 'the motion'} has {count} frames at {old:g} fps: there is nothing to resample"
+        )
+    last = int(np.floor(motion.duration * rate + 1e-6))
+    at = np.minimum(np.arange(last + 1) * (old / rate), count - 1)
+    near = np.round(at)
+    at = np.where(np.abs(at - near) < 1e-6, near, at)
+    i = np.clip(at.astype(int), 0, max(count - 2, 0))
+    j = np.minimum(i + 1, count - 1)
+    u = (at - i)[:, None, None]
+    t, q = np.asarray(motion.translations), np.asarray(motion.rotations)
+    left = motion.duration - last / rate
+    note = f"resampled from {old:.6g} to {rate:.6g} fps" + (
+        f"; the last {left:.3g} s have no frame" if left > 1e-6 else ""
+    )
+    return replace(
+        motion,
+        translations=_between(t[..., i, :, :], t[..., j, :, :], u.astype(t.dtype), _linear),
+        rotations=_between(q[..., i, :, :], q[..., j, :, :], u.astype(q.dtype), _slerp),
+        rate=rate,
+        notes=(*motion.notes, note),
+    )
+
+
+def _between(a: np.ndarray, b: np.ndarray, u: np.ndarray, mix: Any) -> np.ndarray:
+    """`mix(a, b, u)`, and exactly `a` or `b` at their own times, whatever the other is."""
+    return np.where(u == 0, a, np.where(u == 1, b, mix(a, b, u)))
+
+
+def _linear(a: np.ndarray, b: np.ndarray, u: np.ndarray) -> np.ndarray:
+    return (1 - u) * a + u * b
+
+
+def _slerp(a: np.ndarray, b: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Unit quaternions (..., 4) between `a` and `b`; the angle from chords, which is exact for small ones too."""
+    b = np.where((a * b).sum(-1, keepdims=True) < 0, -b, b)
+    half = 2 * np.arctan2(np.linalg.norm(b - a, axis=-1, keepdims=True), np.linalg.norm(b + a, axis=-1, keepdims=True))
+    small = half < 1e-4
+    s = np.where(small, 1, np.sin(half))
+    mixed = np.where(small, _linear(a, b, u), (np.sin((1 - u) * half) * a + np.sin(u * half) * b) / s)
+    return mixed / np.linalg.norm(mixed, axis=-1, keepdims=True)
+
+
 def clip_name(path: str | Path) -> str:
     """The name that a result gives to a file: its last path component."""
     return Path(path).name

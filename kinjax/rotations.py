@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .numerics import safe_norm, safe_sqrt
+from .numerics import safe_sqrt
 
 Quaternion = Float[Array, "4 ..."]
 Vector = Float[Array, "3 ..."]
@@ -93,7 +93,7 @@ def matrix(q: Quaternion) -> Float[Array, "3 3 ..."]:
 
 def exp(v: Vector) -> Quaternion:
     """Quaternion of a rotation vector (radians, full angle)."""
-    angle = safe_norm(v, axis=0)
+    angle = safe_sqrt(dot(v, v))  # where the square underflows the series does not need it
     half = angle / 2
     small = angle < 1e-3
     safe = jnp.where(small, jnp.ones_like(angle), angle)
@@ -105,7 +105,7 @@ def exp(v: Vector) -> Quaternion:
 def log(q: Quaternion) -> Vector:
     """Rotation vector of a quaternion, angle in [0, pi]."""
     q = jnp.where(q[0] < 0, -q, q)
-    s = safe_norm(q[1:], axis=0)
+    s = safe_sqrt(dot(q[1:], q[1:]))
     small = s < 1e-4
     safe = jnp.where(small, jnp.ones_like(s), s)
     # 2 asin(s)/s by its series where the quotient would lose the gradient

@@ -60,11 +60,19 @@ class Topology:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Skeleton:
-    """A topology with its measures: `offsets` (J, 3) and `end_offsets` (E, 3), metres, in the parent joint's frame."""
+    """A topology with its measures: `offsets` (J, 3) and `end_offsets` (E, 3), metres, in the parent joint's frame.
+
+    masses: (J,) of the body parts that the joints carry, in any unit; mass_centers: (J, 3) their centres, metres in the
+    joint's own frame. limits: (J, 3, 2) radians, lower and upper bound of each component of the joint's rotation vector
+    from the identity. None where nothing is known: `anthropometry` then finds masses by the joints' names.
+    """
 
     offsets: Float[Array, "joints 3"]
     end_offsets: Float[Array, "ends 3"]
     topology: Topology = field(metadata={"static": True})
+    masses: Float[Array, " joints"] | None = None
+    mass_centers: Float[Array, "joints 3"] | None = None
+    limits: Float[Array, "joints 3 2"] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ import pytest
 
 from kinjax.annotations import TYPES, Constraint, Constraints, NoisePattern, Template, check_type
 from kinjax.errors import FileFormatError, KinjaxError, OptionError, ShapeError, UnknownNameError, find_name
-from kinjax.motion import Motion, clip_name, make_poses
+from kinjax.motion import Motion, clip_name, make_poses, resample
 from kinjax.skeleton import Skeleton, Topology
 
 FRAMES, NAMES = 12, ("LeftFoot", "RightFoot")
@@ -128,6 +128,64 @@ def test_motion():
     with pytest.raises(OptionError, match=r"5..9 are not inside the clip's 0..8"):
         motion.slice(5, 9)
     assert motion.slice(3, 3).duration == 0
+
+
+def turning(frames=9, rate=100.0, dtype=float):
+    """Every joint turns about z by 0.1 rad a frame, signs of quaternions mixed; the roots move by 1 cm a frame."""
+    half = 0.05 * np.arange(frames)
+    q = np.zeros((frames, 4, 4), dtype)
+    q[..., 0], q[..., 3] = np.cos(half)[:, None], np.sin(half)[:, None]
+    q[::2] *= -1
+    t = np.tile(0.01 * np.arange(frames, dtype=dtype)[:, None, None], (1, 2, 3))
+    return Motion(t, q, SKELETON, rate, name="clip")
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("rate", [25.0, 40.0, 100.0, 240.0, 24.0])
+def test_resample(rate, dtype):
+    motion = turning(dtype=dtype)
+    new = resample(motion, rate)
+    assert new.rate == rate and new.frames == int(0.08 * rate + 1e-9) + 1 and new.skeleton is SKELETON
+    assert new.rotations.dtype == new.translations.dtype == dtype
+    time = np.arange(new.frames) / rate
+    tight = 1e-6 if dtype == "float32" else 1e-12
+    np.testing.assert_allclose(new.translations[:, 1, 2], time, atol=tight)
+    half = 5 * time
+    right = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
+    agree = np.abs((np.asarray(new.rotations[:, 2], float) * right).sum(-1))
+    np.testing.assert_allclose(agree, 1, atol=tight)
+    np.testing.assert_allclose(np.linalg.norm(new.rotations, axis=-1), 1, atol=tight)
+    cut = 0.08 - time[-1] > 1e-6
+    assert ("have no frame" in new.notes[-1]) == cut and f"to {rate:g} fps" in new.notes[-1]
+
+
+def test_resample_keeps_frames_at_their_times_and_batches():
+    motion = turning()
+    np.testing.assert_array_equal(resample(motion, 25.0).rotations, motion.rotations[::4])
+    both = dataclasses.replace(
+        motion, translations=np.stack([motion.translations] * 2), rotations=np.stack([motion.rotations] * 2)
+    )
+    two = resample(both, 30.0)
+    assert two.rotations.shape == (2, 3, 4, 4)
+    np.testing.assert_array_equal(two.rotations[1], resample(motion, 30.0).rotations)
+    assert resample(motion.slice(4, 4), 24.0).frames == 1
+
+
+def test_resample_does_not_spread_what_is_not_finite():
+    motion = turning()
+    motion.rotations[4] = np.nan
+    assert not np.isfinite(resample(motion, 25.0).rotations[1]).any()
+    lost = np.flatnonzero(~np.isfinite(resample(motion, 200.0).rotations).all((1, 2)))
+    assert lost.tolist() == [7, 8, 9]
+    assert np.isfinite(resample(motion, 200.0).translations).all()
+
+
+def test_resample_refuses():
+    for rate in (0.0, -24.0, float("nan"), float("inf")):
+        with pytest.raises(OptionError, match="rate is"):
+            resample(turning(), rate)
+    with pytest.raises(ShapeError, match="nothing to resample"):
+        resample(dataclasses.replace(turning(), rate=0.0), 24.0)
 
 
 def test_segment_centers():

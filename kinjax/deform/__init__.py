@@ -1,0 +1,29 @@
+"""Deformation: a motion bent to constraints of any number of strict priorities, smoothly, in balance (2004 paper).
+
+In: a `Motion` and constraints. Out: `Deformation`, the new motion and a report. `deform` is the door; `redeform` follows an
+edit, `deform_many` takes several clips at once.
+"""
+
+from .cleaning import clean, constraints_from
+from .constraints import CenterOfMass, Goal, LookAt, Orientation, Position, Through
+from .pipeline import deform, deform_many, redeform
+from .results import STATUSES, Deformation, Report
+from .settings import Settings
+
+__all__ = [
+    "STATUSES",
+    "CenterOfMass",
+    "Deformation",
+    "Goal",
+    "LookAt",
+    "Orientation",
+    "Position",
+    "Report",
+    "Settings",
+    "Through",
+    "clean",
+    "constraints_from",
+    "deform",
+    "deform_many",
+    "redeform",
+]

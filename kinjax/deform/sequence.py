@@ -1,0 +1,100 @@
+"""The frame loop: every frame starts where the one before it ended.
+
+In: a clip's goals and the input's poses, all frames along the first axis. Out: the poses and what is known of each frame.
+Source: 2004 paper, section 5.1, eq. 4: joints that a constraint controls start at their previous output, the others at the
+input, whose values they keep.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .chain import Chain, Pose
+from .frame_solver import Reference, Solving, solve_frame
+from .tasks import Goals, Kinds, Tasks
+
+
+class Frames(NamedTuple):
+    """F frames of input: local rotations (F, 4, P), root (F, 3), the joints' places in their parents' frames (F, P, 3), which
+    joints are controlled (F, P) and whether the root's place is (F,), as 0 or 1, whether the frame starts where the one
+    before it ended (F,) or, with 0, at the input, and the goals."""
+
+    rotations: Float[Array, "f 4 p"]
+    root: Float[Array, "f 3"]
+    offsets: Float[Array, "f p 3"]
+    controlled: Float[Array, "f p"]
+    root_controlled: Float[Array, " f"]
+    warm: Float[Array, " f"]
+    goals: Goals
+
+
+class Solved(NamedTuple):
+    """F frames of output: poses, and what `State` says of each frame; sound is False where the solve was not finite and the
+    frame is the input's."""
+
+    rotations: Float[Array, "f 4 p"]
+    root: Float[Array, "f 3"]
+    iterations: Int[Array, " f"]
+    rank: Int[Array, "f layers"]
+    solo: Float[Array, "f b"]
+    own: Float[Array, "f layers"]
+    stayed: Bool[Array, " f"]
+    sound: Bool[Array, " f"]
+    trust: Float[Array, "f layers"]
+
+
+class Carried(NamedTuple):
+    """What a frame hands to the next: its pose (C = 1) and the trust of its layers (`State`)."""
+
+    pose: Pose
+    trust: Float[Array, " layers"]
+
+
+def solve_sequence(
+    chain: Chain,
+    tasks: Tasks,
+    frames: Frames,
+    first: Carried,
+    solving: Solving,
+    layers: int,
+    kinds: Kinds,
+    attract: tuple[bool, bool] = (True, True),
+) -> tuple[Carried, Solved]:
+    """All frames in their order, from the pose `first` (C = 1); gives the last pose, too.
+
+    attract: whether joints, and the root's translation, are drawn to the input. A frame whose solve is not finite restarts
+    from the input and is flagged; where the input itself is not finite, the next frame starts from the last sound one.
+    """
+
+    def step(carried: Carried, x: Frames) -> tuple[Carried, Solved]:
+        last, trust = carried
+        own = Pose(x.rotations[..., None], x.root[:, None])
+        start = Pose(
+            jnp.where((x.controlled * x.warm)[None, :, None] > 0, last.rotations, own.rotations),
+            jnp.where(x.root_controlled * x.warm * x.goals.root_free > 0, last.root, own.root),
+        )
+        reference = Reference(
+            x.rotations,
+            x.root,
+            float(attract[0]) * x.controlled,
+            float(attract[1]) * x.root_controlled * x.goals.root_free,
+        )
+        s = solve_frame(chain, tasks, x.goals, start, x.offsets, reference, layers, solving, kinds, trust)
+        sound = jnp.isfinite(s.pose.rotations).all() & jnp.isfinite(s.pose.root).all() & jnp.isfinite(s.errors).all()
+        pose = Pose(
+            jnp.where(sound & (x.controlled[None, :, None] > 0), s.pose.rotations, own.rotations),
+            jnp.where(sound & (x.root_controlled * x.goals.root_free > 0), s.pose.root, own.root),
+        )
+        known = jnp.isfinite(pose.rotations).all() & jnp.isfinite(pose.root).all()
+        kept = Pose(jnp.where(known, pose.rotations, last.rotations), jnp.where(known, pose.root, last.root))
+        trust = jnp.where(sound, s.trust, trust)
+        out = Solved(
+            pose.rotations[..., 0], pose.root[:, 0], s.iterations, s.rank, s.solo, s.own, s.stayed, sound, trust
+        )  # fmt: skip
+        return Carried(kept, trust), out
+
+    return jax.lax.scan(step, first, frames)

@@ -1,0 +1,194 @@
+"""A plan through the compiled program, piece by piece.
+
+In: a plan and what every frame starts from. Out: `Run`, poses of the whole skeleton. The clip goes through one compiled
+program in pieces of `PIECE` frames: one compilation serves clips of every length, and an edit runs only the pieces that it
+can reach.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+
+from .chain import Pose
+from .frame_solver import Solving
+from .plan import Plan
+from .sequence import Carried, Frames, Solved, solve_sequence
+from .settings import Settings
+from .tasks import Kinds
+
+PIECE = 32
+"""Frames that one call of the compiled program solves."""
+
+SAME = 1e-9
+"""Radians and metres within which two poses lead to the same next frames."""
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One pass over a clip: what was asked of each frame (`asked`, digests), the frames that it started from, and `solved`, in
+    the order of the plan's chain and constraints, padding included."""
+
+    plan: Plan
+    asked: list[bytes]
+    frames: Any
+    solved: Any
+
+
+@partial(jax.jit, static_argnames=("layers", "kinds", "attract"))
+def _solve(*args: Any, layers: int, kinds: Kinds, attract: tuple[bool, bool]) -> tuple[Carried, Solved]:
+    chain, tasks, frames, first, solving = args
+    return solve_sequence(chain, tasks, frames, first, solving, layers, kinds, attract)
+
+
+@partial(jax.jit, static_argnames=("layers", "kinds", "attract"))
+def _solve_many(*args: Any, layers: int, kinds: Kinds, attract: tuple[bool, bool]) -> tuple[Carried, Solved]:
+    def one(chain: Any, tasks: Any, frames: Any, first: Any, solving: Any) -> tuple[Carried, Solved]:
+        return solve_sequence(chain, tasks, frames, first, solving, layers, kinds, attract)
+
+    return jax.vmap(one, in_axes=(0, 0, 0, 0, None))(*args)
+
+
+def solve(
+    plan: Plan, frames: Frames, asked: list[bytes], settings: Settings, tell: Callable[[int], None], old: Run | None
+) -> Run:
+    """All frames of one clip. old: an earlier run over the same motion; pieces that would come out the same are its own."""
+    dtype = np.dtype(settings.precision)
+    chain, tasks, cast = (_cast(t, dtype) for t in (plan.chain, plan.tasks, frames))
+    static = {"layers": plan.layers, "kinds": plan.kinds, "attract": (settings.attract, settings.attract_root)}
+    numbers = _solving(settings, dtype)
+    count = len(frames.root)
+    same = _unchanged(frames, asked, plan, old)
+    pose = _begin(cast.rotations[0], cast.root[0], plan.layers)
+    out: list[Any] = []
+    linked = True  # the pose that enters this piece is the one that entered it in the old run
+    for begin in range(0, count, PIECE):
+        end = min(begin + PIECE, count)
+        if old is not None and linked and same[begin:end].all():
+            piece = _taken(old, plan, begin, end)
+        else:
+            _, piece = _solve(chain, tasks, _piece(cast, begin, end), pose, numbers, **static)
+            piece = jax.tree.map(lambda x, n=end - begin: np.asarray(x)[:n], piece)
+        out.append(piece)
+        pose = _last(piece, pose)
+        linked = old is not None and _close(pose, _last(_taken(old, plan, begin, end), pose))
+        tell(end - begin)
+    return Run(plan, asked, frames, jax.tree.map(lambda *x: np.concatenate(x), *out))
+
+
+def solve_many(plans: Sequence[Plan], settings: Settings, tell: Callable[[int], None]) -> list[Any]:
+    """Several clips side by side; their plans have arrays of the same shapes (frames apart)."""
+    dtype = np.dtype(settings.precision)
+    static = {"layers": plans[0].layers, "kinds": plans[0].kinds, "attract": (settings.attract, settings.attract_root)}
+    numbers = _solving(settings, dtype)
+    cast = [_cast(p.frames, dtype) for p in plans]
+    chain, tasks = (
+        _stack([_cast(t, dtype) for t in ts]) for ts in ([p.chain for p in plans], [p.tasks for p in plans])
+    )
+    counts = [len(p.frames.root) for p in plans]
+    pose = _stack([_begin(f.rotations[0], f.root[0], plans[0].layers) for f in cast])
+    out: list[Any] = []
+    for begin in range(0, max(counts), PIECE):
+        pieces = _stack(
+            [_piece(f, min(begin, n - 1), min(begin + PIECE, n), begin >= n) for f, n in zip(cast, counts, strict=True)]
+        )
+        pose, piece = _solve_many(chain, tasks, pieces, pose, numbers, **static)
+        out.append(jax.tree.map(np.asarray, piece))
+        tell(sum(min(PIECE, max(n - begin, 0)) for n in counts))
+    whole = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *out)
+    return [jax.tree.map(lambda x, i=i, n=n: x[i, :n], whole) for i, n in enumerate(counts)]
+
+
+def _solving(settings: Settings, dtype: np.dtype) -> Solving:
+    values: Any = [
+        np.asarray(getattr(settings, n), np.int32 if n == "iterations" else dtype) for n in Solving._fields
+    ]
+    return Solving(*values)
+
+
+def _cast(tree: Any, dtype: np.dtype) -> Any:
+    return jax.tree.map(lambda x: x.astype(dtype) if np.issubdtype(x.dtype, np.floating) else x, tree)
+
+
+def _stack(trees: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *x: np.stack(x), *trees)
+
+
+def _begin(rotations: np.ndarray, root: np.ndarray, layers: int) -> Any:
+    """What the first frame starts from; parts of it that are not finite begin at rest."""
+    q = np.where(np.isfinite(rotations).all(0), rotations, np.eye(4, 1, dtype=rotations.dtype))
+    pose: Any = q[..., None], np.where(np.isfinite(root), root, 0)[:, None]
+    trust: Any = np.ones(layers, root.dtype)
+    return Carried(Pose(*pose), trust)
+
+
+def _piece(frames: Any, begin: int, end: int, empty: bool = False) -> Any:
+    """Frames `begin..end-1` filled up to `PIECE` with copies of the last, of which nothing is asked (of none, if `empty`)."""
+    piece = jax.tree.map(lambda x: x[begin:end], frames)
+    more = PIECE - (end - begin)
+    if more:
+        piece = jax.tree.map(lambda x: np.concatenate([x, np.repeat(x[-1:], more, axis=0)]), piece)
+    if more or empty:
+        active = piece.goals.active.copy()
+        active[0 if empty else end - begin :] = 0
+        piece = piece._replace(goals=piece.goals._replace(active=active))
+    return piece
+
+
+def _last(piece: Any, before: Any) -> Any:
+    """What the frame after a piece starts from: the last finite pose, and the trust."""
+    known = np.isfinite(piece.rotations).all((1, 2)) & np.isfinite(piece.root).all(1)
+    if not known.any():
+        return before
+    at = len(known) - 1 - int(known[::-1].argmax())
+    return Carried(Pose(piece.rotations[at][..., None], piece.root[at][:, None]), piece.trust[-1])
+
+
+def _unchanged(frames: Any, asked: list[bytes], plan: Plan, old: Run | None) -> np.ndarray:
+    """(F,) the frames of which the same is asked as in the old run, from the same start."""
+    if old is None or len(asked) != len(old.asked):
+        return np.zeros(len(asked), bool)
+    same = np.array([a == b for a, b in zip(asked, old.asked, strict=True)])
+    ours, theirs = _shared(plan, old.plan)
+    same &= (frames.rotations[:, :, ours] == old.frames.rotations[:, :, theirs]).all((1, 2))
+    for name in ("root", "warm"):
+        same &= (getattr(frames, name) == getattr(old.frames, name)).reshape(len(same), -1).all(1)
+    return same & (frames.goals.root_free == old.frames.goals.root_free)
+
+
+def _shared(a: Plan, b: Plan) -> tuple[np.ndarray, np.ndarray]:
+    """Places, in the chains of both plans, of the joints that both have."""
+    return np.flatnonzero(np.isin(a.kept, b.kept)), np.flatnonzero(np.isin(b.kept, a.kept))
+
+
+def _taken(old: Run, plan: Plan, begin: int, end: int) -> Any:
+    """Frames `begin..end-1` of an old run in the order of this plan's chain and constraints.
+
+    Joints that only this plan has are not controlled in these frames, and are the input's. The constraints that are active
+    in a frame are the same in both plans, in the same order.
+    """
+    ours, theirs = _shared(plan, old.plan)
+    s = jax.tree.map(lambda x: x[begin:end], old.solved)
+    rotations = plan.frames.rotations[begin:end].astype(s.rotations.dtype)
+    rotations[:, :, ours] = s.rotations[:, :, theirs]
+    b, n = plan.frames.goals.active.shape[1], plan.layers
+    solo = np.ones((end - begin, b), s.solo.dtype)
+    own, rank = np.ones((end - begin, n), s.own.dtype), np.zeros((end - begin, n), s.rank.dtype)
+    trust = s.trust if n == old.plan.layers else np.ones((end - begin, n), s.trust.dtype)
+    for f in range(begin, end):
+        new_on, old_on = np.flatnonzero(plan.frames.goals.active[f]), np.flatnonzero(old.plan.frames.goals.active[f])
+        if len(new_on) == len(old_on):
+            solo[f - begin, new_on] = s.solo[f - begin, old_on]
+            to, of = plan.tasks.layer[new_on], old.plan.tasks.layer[old_on]
+            own[f - begin, to], rank[f - begin, to] = s.own[f - begin, of], s.rank[f - begin, of]
+    return s._replace(rotations=rotations, solo=solo, own=own, rank=rank, trust=trust)
+
+
+def _close(a: Any, b: Any) -> bool:
+    gaps = [np.abs(x - y).max(initial=0.0) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)]
+    return bool(max(gaps) < SAME)
