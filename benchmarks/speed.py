@@ -186,9 +186,7 @@ def window_stage() -> None:
     from kinjax.kinematics import object_poses
 
     poses = object_poses(walking_crowd(2048), ["j3", "j7", "j15", "j30"])
-    arrays = prepared(poses, None, None, Settings()).arrays
-    clip = Clip(*(jnp.swapaxes(jnp.asarray(x), 0, 1) for x in arrays))
-    clip = Clip(jnp.moveaxis(clip.q, -1, 0), jnp.moveaxis(clip.t, -1, 0), clip.valid)
+    clip = Clip(*map(jnp.asarray, prepared(poses, None, None, Settings()).arrays))
     shortest, longest = 7, 48
     count = clip.valid.size * (longest - shortest + 1)
     reward = Reward(

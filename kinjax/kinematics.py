@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,40 +22,46 @@ from .rotations import multiply, rotate
 
 
 def world_transforms(
-    rotations: Float[Array, "frames joints 4"],
-    moving: Float[Array, "frames t 3"],
+    rotations: Float[Array, "joints 4 frames"],
+    moving: Float[Array, "t 3 frames"],
     offsets: Float[Array, "joints 3"],
     parents: Int[Array, " joints"],
     translated: Int[Array, " t"],
-) -> Float[Array, "joints 7 frames"]:
-    """World quaternion and position of every joint, components before frames: the kernel under everything here.
+) -> tuple[Float[Array, "rows frames"], ...]:
+    """The seven components of every joint's world quaternion and position: the kernel under everything here.
 
     rotations: local. offsets: metres in the parent's frame; the `translated` joints have `moving` ones instead. A root's
-    parent is -1.
+    parent is -1. The row after the last joint's is the identity, the parent of the roots.
     """
-    frames, joints, _ = rotations.shape
+    joints, _, frames = rotations.shape
     own = jnp.full(joints, -1, jnp.int32).at[translated].set(jnp.arange(translated.shape[0], dtype=jnp.int32))
-    paths = jnp.moveaxis(moving, 0, -1)
-    # one row more than joints, the identity, is the parent of the roots
-    world = jnp.zeros((joints + 1, 7, frames), rotations.dtype).at[joints, 0].set(1)
+    one, zero = jnp.ones(frames, rotations.dtype), jnp.zeros(frames, rotations.dtype)
+    identity = (one, *(zero,) * 6)
 
-    def step(world: Float[Array, "rows 7 frames"], x: tuple[Array, ...]) -> tuple[Array, None]:
-        j, parent, q, offset, path = x
-        above = jax.lax.dynamic_index_in_dim(world, parent, 0, keepdims=False)
-        moved = jax.lax.dynamic_index_in_dim(paths, jnp.maximum(path, 0), 0, keepdims=False)
-        t = jnp.where(path >= 0, moved, offset[:, None])
-        here = jnp.concatenate([multiply(above[:4], q), above[4:] + rotate(above[:4], t)])
-        return jax.lax.dynamic_update_index_in_dim(world, here, j, 0), None
+    # one array a component, each of which a step writes in one vectorised pass (a concatenation would not be one). A step
+    # fetches its successor's parent after it has written: were its own fetched first, XLA would copy the arrays every step
+    def step(carried: Any, x: tuple[Array, ...]) -> tuple[Any, None]:
+        world, above = carried
+        j, following, q, offset, path = x
+        moved = jax.lax.dynamic_index_in_dim(moving, jnp.maximum(path, 0), 0, keepdims=False)
+        t = [jnp.where(path >= 0, m, o) for m, o in zip(moved, offset, strict=True)]
+        here = (*multiply(above[:4], q), *(a + b for a, b in zip(above[4:], rotate(above[:4], t), strict=True)))
+        world = tuple(jax.lax.dynamic_update_index_in_dim(w, h, j, 0) for w, h in zip(world, here, strict=True))
+        above = tuple(jax.lax.dynamic_index_in_dim(w, following, 0, keepdims=False) for w in world)
+        return (world, above), None
 
-    order = jnp.arange(joints, dtype=jnp.int32)
-    xs = order, jnp.where(parents < 0, joints, parents), jnp.moveaxis(rotations, 0, -1), offsets, own
-    return jax.lax.scan(step, world, xs)[0][:joints]
+    rows = jnp.where(parents < 0, joints, parents)
+    above = identity  # the first joint is a root
+    xs = jnp.arange(joints, dtype=jnp.int32), jnp.roll(rows, -1), rotations, offsets, own
+    world = tuple(jnp.broadcast_to(x, (joints + 1, frames)) for x in identity)
+    return jax.lax.scan(step, (world, above), xs)[0][0]
 
 
 @jax.jit
 def _forward(rotations: Array, moving: Array, offsets: Array, parents: Array, translated: Array) -> tuple[Array, Array]:
-    world = jnp.moveaxis(world_transforms(rotations, moving, offsets, parents, translated), -1, 0)
-    return world[..., :4], world[..., 4:]
+    rotations, moving = (jnp.moveaxis(x, 0, -1) for x in (rotations, moving))
+    world = [x[:-1].T for x in world_transforms(rotations, moving, offsets, parents, translated)]
+    return jnp.stack(world[:4], axis=-1), jnp.stack(world[4:], axis=-1)
 
 
 def forward_kinematics(motion: Motion) -> tuple[Float[Array, "frames joints 4"], Float[Array, "frames joints 3"]]:

@@ -6,7 +6,9 @@ substituting *before* an operation and selecting *after* it, so that neither val
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -110,14 +112,15 @@ def over_rows(f: Callable[[Array], Array], rows: Array) -> Array:
 def packed_bits(flags: Bool[Array, "lanes n"]) -> Bits:
     """32 flags a word, the first in the lowest bit: what looks at runs of flags then reads a thirty-second of the memory.
 
-    Two products with powers of two (exact in float32) pack them; missing flags at the end are False.
+    Four flags are the four bytes of a word, which one product brings together in its highest byte. Missing flags at the end
+    are False.
     """
-    n = flags.shape[-1]
+    lanes, n = flags.shape
     whole = flags if n % 32 == 0 else jnp.pad(flags, [(0, 0), (0, -n % 32)])
-    powers = jnp.asarray([2.0**k for k in range(16)], jnp.float32)
-    halves = jnp.matmul(whole.reshape(flags.shape[0], -1, 2, 16).astype(jnp.float32), powers, precision="highest")
-    low, high = halves[..., 0].astype(jnp.uint32), halves[..., 1].astype(jnp.uint32)
-    return low | (high << jnp.uint32(16))
+    fours = jax.lax.bitcast_convert_type(whole.astype(jnp.uint8).reshape(lanes, -1, 4), jnp.uint32)
+    eights = ((fours * jnp.uint32(0x01020408)) >> jnp.uint32(24)).reshape(lanes, -1, 8)
+    parts = (eights[..., k] << jnp.uint32(4 * k) for k in range(8))
+    return functools.reduce(jnp.bitwise_or, parts)
 
 
 def bits_before(words: Bits) -> Bits:
@@ -139,10 +142,13 @@ def _counts(words: Bits) -> tuple[Int[Array, "lanes words"], Int[Array, "lanes w
     return until, until - own
 
 
-def true_positions(words: Bits, most: int) -> tuple[Int[Array, "lanes most"], Int[Array, " lanes"]]:
-    """Indices of the first `most` true flags of each lane (beyond the last word where there are fewer), and their number."""
+def true_positions(
+    words: Bits, most: int, first: int | Int[Array, ""] = 0
+) -> tuple[Int[Array, "lanes most"], Int[Array, " lanes"]]:
+    """Indices of `most` true flags of each lane from number `first` on (beyond the last word where there are fewer), and the
+    number of all."""
     until, before = _counts(words)
-    rank = jnp.arange(1, most + 1, dtype=jnp.int32)
+    rank = first + jnp.arange(1, most + 1, dtype=jnp.int32)
     block = jnp.sum(until[:, None, :] < rank[:, None], axis=-1, dtype=jnp.int32)
     found = jnp.minimum(block, words.shape[-1] - 1)
     left = rank - jnp.take_along_axis(before, found, axis=1)
@@ -161,6 +167,38 @@ def counts_at(words: Bits, index: Int[Array, "lanes k"]) -> Int[Array, "lanes k"
     upto = (jnp.uint32(2) << bit) - jnp.uint32(1)
     own = jax.lax.population_count(jnp.take_along_axis(words, block, axis=1) & upto).astype(jnp.int32)
     return jnp.take_along_axis(before, block, axis=1) + own
+
+
+def computed_once(x: Any, never: Bool[Array, ""]) -> Any:
+    """`x`, which is computed before anything reads it: else XLA computes it again inside each of its readers. (It removes
+    optimization barriers on the CPU before it fuses.) `never` is a value that is False, which the compiler cannot know:
+    what carries `x` is a loop that does not run."""
+
+    def again(carried: Any) -> Any:
+        return jax.tree.map(lambda y: jnp.roll(y, 1), carried[0]), carried[1]
+
+    return jax.lax.while_loop(lambda carried: carried[1], again, (x, never))[0]
+
+
+CHUNK = 32
+"""Rows that `in_chunks` takes at once."""
+
+
+def in_chunks(step: Any, state: Any, rows: int, count: Int[Array, ""]) -> tuple[Any, Any]:
+    """The last state and the outputs of `step(state, first) -> state, CHUNK rows` over the first `count` of `rows` rows: room
+    for many costs nothing where there are few. `rows` is a multiple of `CHUNK`; the outputs of rows not visited are 0.
+    """
+    like = jax.eval_shape(step, state, jax.ShapeDtypeStruct((), jnp.int32))[1]
+    out = jax.tree.map(lambda y: jnp.zeros((rows, *y.shape[1:]), y.dtype), like)
+
+    def chunk(i: Int[Array, ""], carried: Any) -> Any:
+        state, out = carried
+        first = i * jnp.asarray(CHUNK, jnp.int32)
+        state, new = step(state, first)
+        return state, jax.tree.map(lambda o, n: jax.lax.dynamic_update_slice_in_dim(o, n, first, 0), out, new)
+
+    needed = jnp.minimum((count + CHUNK - 1) // CHUNK, rows // CHUNK)
+    return jax.lax.fori_loop(jnp.zeros_like(needed), needed, chunk, (state, out))
 
 
 def bucket(n: int, smallest: int = 64) -> int:

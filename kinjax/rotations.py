@@ -1,11 +1,13 @@
 """Rotations as quaternions `wxyz`, with the components along the **first** axis.
 
-In and out: arrays (4, ...) and (3, ...). Hot kernels keep components first, so that every operation runs down long
-contiguous rows; `axis=-1` arrays of the public types are moved once, at the entry. `exp` takes rotation vectors (full
-angle) to quaternions, `log` back. Quaternions are unit unless said.
+In and out: arrays (4, ...) and (3, ...), or their components as separate arrays. Hot kernels keep components first, so
+that every operation runs down long contiguous rows; `axis=-1` arrays of the public types are moved once, at the entry.
+`exp` takes rotation vectors (full angle) to quaternions, `log` back. Quaternions are unit unless said.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -14,9 +16,11 @@ from .numerics import safe_sqrt
 
 Quaternion = Float[Array, "4 ..."]
 Vector = Float[Array, "3 ..."]
+Parts = Sequence[Float[Array, "..."]]
+"""The components of either as separate arrays: what is never stacked need not be taken apart again."""
 
 
-def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+def multiply(a: Quaternion | Parts, b: Quaternion | Parts) -> Quaternion:
     """Hamilton product: first `b`, then `a`."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
@@ -32,17 +36,18 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 
 def conjugate(q: Quaternion) -> Quaternion:
     """Inverse rotation."""
-    return jnp.concatenate([q[:1], -q[1:]])
+    w, x, y, z = q
+    return jnp.stack([w, -x, -y, -z])
 
 
-def cross(a: Vector, b: Vector) -> Vector:
+def cross(a: Vector | Parts, b: Vector | Parts) -> Vector:
     """Cross product."""
     ax, ay, az = a
     bx, by, bz = b
     return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
-def dot(a: Float[Array, "c ..."], b: Float[Array, "c ..."]) -> Float[Array, "..."]:
+def dot(a: Float[Array, "c ..."] | Parts, b: Float[Array, "c ..."] | Parts) -> Float[Array, "..."]:
     """Inner product over the first axis, component by component (XLA reduces a short leading axis slowly)."""
     return sum((x * y for x, y in zip(a[1:], b[1:], strict=True)), a[0] * b[0])
 
@@ -57,18 +62,21 @@ def apply_transposed(r: Float[Array, "3 3 ..."], v: Vector) -> Vector:
     return jnp.stack([dot(r[:, k], v) for k in range(3)])
 
 
-def rotate(q: Quaternion, v: Vector) -> Vector:
+def rotate(q: Quaternion | Parts, v: Vector | Parts) -> Vector:
     """`R(q) v`."""
-    t = jnp.asarray(2.0, v.dtype) * cross(q[1:], v)
-    return v + q[0] * t + cross(q[1:], t)
+    w, *u = q
+    t = [x + x for x in cross(u, v)]
+    return jnp.stack([x + w * y + z for x, y, z in zip(v, t, cross(u, t), strict=True)])
 
 
 def normalize(q: Quaternion) -> Quaternion:
     """Unit quaternion; zero and non-finite ones become the identity (their frames are masked)."""
     n2 = dot(q, q)
     good = (n2 > 0) & jnp.isfinite(n2)
-    q = jnp.where(good, q, jnp.zeros_like(q).at[0].set(1))
-    return q * (1 / safe_sqrt(dot(q, q)))
+    # component by component: what selects on a stack of them does not vectorise
+    parts = [jnp.where(good, x, 0 if i else 1) for i, x in enumerate(q)]
+    scale = 1 / safe_sqrt(dot(parts, parts))
+    return jnp.stack([x * scale for x in parts])
 
 
 def matrix(q: Quaternion) -> Float[Array, "3 3 ..."]:

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from kinjax.detect.displacements import displacements
 from kinjax.detect.instantaneous import instantaneous
-from kinjax.detect.interface import World
 from kinjax.detect.prepare import prepared
 from kinjax.detect.settings import Settings
 from kinjax.detect.sigma_epsilon import SigmaEpsilon, project
@@ -42,16 +41,11 @@ def signals_of(q: jax.Array, t: jax.Array, valid: jax.Array) -> tuple[SigmaEpsil
     return y, instantaneous(*y[:4], x.valid, limits, limits, jnp.asarray(1e-3, q.dtype))
 
 
-def components_first(world: World) -> list[jax.Array]:
-    """Prepared poses as the kernels take them: quaternions (4, objects, frames), positions (3, ...), valid."""
-    return [jnp.swapaxes(jnp.moveaxis(x, -1, 0), -1, -2) for x in world[:2]] + [jnp.asarray(world.valid).T]
-
-
 def signals(poses: Poses, dtype: str = "float64") -> tuple[SigmaEpsilon, np.ndarray]:
     """Steps 1 to 3 and 5 of a clip as the pipeline prepares it: padded, positions taken from a place near the object."""
     with jax.enable_x64(dtype == "float64"):
         clip = prepared(poses, None, None, Settings())
-        y, kind = signals_of(*components_first(clip.arrays))
+        y, kind = signals_of(*map(jnp.asarray, clip.arrays))
     cut = slice(0, clip.frames - 1)
     return SigmaEpsilon(*(np.asarray(x)[..., cut] for x in y)), np.asarray(kind)[..., cut]
 

@@ -22,7 +22,7 @@ from kinjax.formats.euler import euler_to_quaternion, quaternion_to_euler, rotat
 from kinjax.kinematics import quaternions_of
 from kinjax.motion import make_poses
 
-from .clips import LIMITS, components_first, foot, moved, signals, signals_of, spoilt
+from .clips import LIMITS, foot, moved, signals, signals_of, spoilt
 from .lmeds_sets import kept
 from .screws import angle_between, gradients, matrices, projected, projected_from_poses, screws, unit
 from .table import Row
@@ -205,7 +205,7 @@ def n11(full: bool = True) -> Iterator[Row]:
     """The same answer however it is computed: alone or in a batch, padded or not, jitted or not."""
     n = foot().frames - 1
     with jax.enable_x64(True):
-        padded = components_first(prepared(foot(), None, None, Settings()).arrays)
+        padded = [jnp.asarray(x) for x in prepared(foot(), None, None, Settings()).arrays]
         exact, back = [x[..., : n + 1] for x in padded], [x[..., ::-1] for x in padded]
         alone, labels = signals_of(*exact)
         batch = signals_of(*(jnp.concatenate([x, y, x], -2) for x, y in zip(padded, back, strict=True)))

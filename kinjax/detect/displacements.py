@@ -16,7 +16,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..numerics import over_rows
+from ..numerics import computed_once, over_rows
 from ..rotations import conjugate, dot, matrix, multiply, normalize
 
 
@@ -38,7 +38,8 @@ def displacements(
     """Displacements from frame `i` to `i + k`, for the `frames - k` intervals that have both."""
     q0, q1 = q[..., :-k], q[..., k:]
     r = multiply(q1, conjugate(q0))
-    return Displacement(r[1:], r[0], t[..., k:] - t[..., :-k], valid[..., :-k] & valid[..., k:])
+    d = jnp.stack([x[..., k:] - x[..., :-k] for x in t])  # by component: a difference of stacks would not vectorise
+    return Displacement(r[1:], r[0], d, valid[..., :-k] & valid[..., k:])
 
 
 def shifted(x: Array, s: int, fill: float | bool = 0) -> Array:
@@ -81,17 +82,22 @@ def spikes(
     valid: Bool[Array, "objects frames"],
     half: int,
     spike: Float[Array, ""],
+    never: Bool[Array, ""],
 ) -> Bool[Array, "objects frames"]:
     """Frames that a Hampel filter rejects: a coordinate off its running median by `max(4 * 1.4826 MAD, spike)`.
 
     The coordinates are the origin and three points 0.1 m from it along the object's axes, so that a flipped orientation
-    counts like a jump. Window: `2 half + 1` frames, the valid ones of it.
+    counts like a jump. Window: `2 half + 1` frames, the valid ones of it. `never`: as `computed_once` has it.
     """
     lever = jnp.asarray(0.1, t.dtype)
     r = matrix(q)
     coordinates = jnp.concatenate([t, *(t + lever * r[:, k] for k in range(3))])
-    count = sum(shifted(valid, s, False).astype(jnp.int32) for s in range(-half, half + 1))
-    big = jnp.asarray(jnp.finfo(t.dtype).max, t.dtype)
+    frames, big = valid.shape[-1], jnp.asarray(jnp.finfo(t.dtype).max, t.dtype)
+    # what is missing is the largest number, also beyond the ends: a window is then slices of one array, which vectorise
+    rows = jnp.pad(jnp.where(valid, coordinates, big), [(0, 0), (0, 0), (half, half)], constant_values=big)
+    around = jnp.pad(valid.astype(jnp.int32), [(0, 0), (half, half)])
+    around, rows = computed_once((around, rows), never)
+    count = sum(around[:, s : s + frames] for s in range(2 * half + 1))
 
     def median(window: list[Array]) -> Array:
         window = _sorted_network(window)
@@ -102,12 +108,13 @@ def spikes(
         return functools.reduce(jnp.add, parts)
 
     def outlying(x: Array) -> Array:
-        window = [jnp.where(shifted(valid, s, False), shifted(x, s), big) for s in range(-half, half + 1)]
-        middle = median(window)
+        x = computed_once(x, never)  # a slice of `rows` inside the sorting keeps it from vectorising
+        window = [x[..., s : s + frames] for s in range(2 * half + 1)]
+        x, middle = window[half], computed_once(median(window), never)
         mad = median([jnp.where(w == big, big, jnp.abs(w - middle)) for w in window])
         return jnp.abs(x - middle) > jnp.maximum(jnp.asarray(4 * 1.4826, x.dtype) * mad, spike)
 
-    found = over_rows(outlying, coordinates)
+    found = over_rows(outlying, rows)
     return valid & jnp.any(found, axis=0)
 
 
@@ -122,7 +129,10 @@ def _sorted_network(rows: list[Array]) -> list[Array]:
                 for i in range(min(k, n - j - k)):
                     if (i + j) // (2 * p) == (i + j + k) // (2 * p):
                         a, b = rows[i + j], rows[i + j + k]
-                        rows[i + j], rows[i + j + k] = jnp.minimum(a, b), jnp.maximum(a, b)
+                        less = (
+                            a < b
+                        )  # cheaper than minimum and maximum, which also have to pass on what is not a number
+                        rows[i + j], rows[i + j + k] = jnp.where(less, a, b), jnp.where(less, b, a)
             k //= 2
         p *= 2
     return rows

@@ -15,13 +15,13 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..kinematics import world_transforms
-from ..numerics import BLOCK, packed_bits
+from ..numerics import BLOCK, computed_once, packed_bits
 from ..rotations import cross, normalize, rotate
 from . import noise
 from .displacements import Displacement, displacements, mean_pose, spikes
 from .instantaneous import LINE, NONE, POINT, SPACE, instantaneous
-from .interface import Clip, Found, Joints, Numbers, Plan, TemplateSpans, World
-from .merging import Elements, Spans, absorb_short_rests, elements, merge, runs
+from .interface import Clip, Found, Joints, Numbers, Plan, TemplateSpans
+from .merging import Spans, absorb_short_rests, elements, merge, runs
 from .noise import Pattern
 from .pivots import merged_pivots, template_noise
 from .refit import fit, span_moments, span_places
@@ -34,9 +34,13 @@ def run(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, give
     """Steps 1 to 6."""
     paper = plan.method == "paper"
     q, t, seen = clip
-    identity = jnp.zeros_like(q).at[0].set(1)
-    q, t = jnp.where(seen, normalize(q), identity), jnp.where(seen, t, 0)
-    valid = seen if paper else seen & ~spikes(q, t, seen, plan.hampel, numbers.spike)
+    # component by component, here and in what follows: XLA does not vectorise a loop over a stack of them
+    turned = [jnp.where(seen, x, 0 if i else 1) for i, x in enumerate(normalize(q))]
+    moved = [jnp.where(seen, x, 0) for x in t]
+    never = numbers.rate < 0
+    turned, moved, seen = computed_once((turned, moved, seen), never)
+    q, t = jnp.stack(turned), jnp.stack(moved)
+    valid = seen if paper else seen & ~spikes(q, t, seen, plan.hampel, numbers.spike, never)
     clip = Clip(q, t, valid)
     smooth = clip if paper else Clip(*mean_pose(q, t, valid, plan.mean), valid)
     nu = (jnp.zeros_like(t[0, :, 0]),) * 2 if paper else noise.data_noise(q, t, valid)
@@ -57,12 +61,11 @@ def run(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, give
         limits[-1] if paper and plan.lines else None,
         numbers.axis_min,
     )
-    # without barriers XLA computes the projection, or the kinematics, again inside each of its readers
-    passed = jax.lax.optimization_barrier(passed)
+    points, passed = computed_once((points, passed), never)
     if plan.method == "window":
-        items, spans = _rest_windows(plan, numbers, clip, nu, templates)
+        total, spans = _rest_windows(plan, numbers, clip, nu, templates)
     else:
-        items, spans = _merge(plan, numbers, passed, x.valid, points, smooth)
+        total, spans = _merge(plan, numbers, passed, x.valid, points, smooth)
     if not paper:
         spans = settle(
             spans,
@@ -72,7 +75,7 @@ def run(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, give
             0 if plan.method == "window" else plan.span,
             plan.mean + (plan.span + 1) // 2,
         )
-    found, overflow = _refit(plan, numbers, spans, clip), items.total
+    found, overflow = _refit(plan, numbers, spans, clip), total
     pivot_noise = jnp.maximum(numbers.pivot_noise, nu[0])
     if plan.lines and not paper:
         if plan.templates:
@@ -185,8 +188,8 @@ def _thresholds(
 
 def _merge(
     plan: Plan, numbers: Numbers, kind: Array, valid: Array, points: SigmaEpsilon, poses: Clip
-) -> tuple[Elements, Spans]:
-    """Step 6 on displacements; the spans that come out are frames, both included."""
+) -> tuple[Array, Spans]:
+    """How many elements each object has, and step 6 on displacements; the spans that come out are frames, both included."""
     n = kind.shape[-1]
     lines = plan.method == "paper" and plan.lines
     low, high = (0, 1) if plan.method == "paper" else (plan.span // 2, (plan.span + 1) // 2)
@@ -201,15 +204,16 @@ def _merge(
         valid &= ~absorbed
         on_line = kind == LINE
         start, stop = jnp.where(on_line, points.point, start), jnp.where(on_line, points.point, stop)
-    items = elements(kind, runs(kind), valid, missing, start, stop, points.axis if lines else None, plan.capacity)
-    spans = merge(items, numbers.tolerance, lines)
-    return items, Spans(spans.kind, spans.first + low, spans.last + high)
+    find, total = elements(kind, runs(kind), valid, missing, start, stop, points.axis if lines else None)
+    spans = merge(find, total, plan.capacity, numbers.tolerance, lines)
+    return total, Spans(spans.kind, spans.first + low, spans.last + high)
 
 
 def _rest_windows(
     plan: Plan, numbers: Numbers, clip: Clip, nu: tuple[Array, Array], templates: TemplateSpans
-) -> tuple[Elements, Spans]:
-    """Space at interval level (method "window"): the best segmentation into windows at rest, neighbours merged by distance.
+) -> tuple[Array, Spans]:
+    """How many windows each object has, and space at interval level (method "window"): the best segmentation into windows
+    at rest, neighbours merged by distance.
 
     Measured against the noise of the data (position, and rotation at 0.1 m), or the spread of the templates, whichever is
     larger.
@@ -229,7 +233,7 @@ def _rest_windows(
     windows = best_segmentation(window_rewards(*clip, nothing, *plan.rest, reward, rest=True), plan.rest[0])
     kind = jnp.where(windows.inside, SPACE, NONE)
     smooth = mean_pose(*clip, plan.mean)[1]
-    items = elements(
+    find, total = elements(
         kind,
         (packed_bits(windows.is_first), packed_bits(windows.is_last)),
         clip.valid,
@@ -237,9 +241,8 @@ def _rest_windows(
         smooth,
         smooth,
         None,
-        plan.capacity,
     )
-    return items, merge(items, numbers.tolerance, False)
+    return total, merge(find, total, plan.capacity, numbers.tolerance, False)
 
 
 def _refit(plan: Plan, numbers: Numbers, spans: Spans, clip: Clip) -> tuple[Array, ...]:
@@ -258,12 +261,8 @@ def _refit(plan: Plan, numbers: Numbers, spans: Spans, clip: Clip) -> tuple[Arra
 
 
 @partial(jax.jit, static_argnames="plan")
-def run_poses(
-    plan: Plan, numbers: Numbers, world: World, templates: TemplateSpans, given: tuple[Pattern, ...]
-) -> Found:
+def run_poses(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, given: tuple[Pattern, ...]) -> Found:
     """Detection from world poses."""
-    clip = Clip(jnp.moveaxis(world.rotation, -1, 0), jnp.moveaxis(world.position, -1, 0), world.valid)
-    clip = Clip(*jax.lax.optimization_barrier(tuple(jnp.swapaxes(x, -1, -2) for x in clip)))
     return run(plan, numbers, clip, templates, given)
 
 
@@ -272,13 +271,12 @@ def run_joints(
     plan: Plan, numbers: Numbers, joints: Joints, templates: TemplateSpans, given: tuple[Pattern, ...]
 ) -> Found:
     """Detection from joint rotations: forward kinematics first, in the same compiled function."""
-    return run(plan, numbers, Clip(*jax.lax.optimization_barrier(joint_poses(joints))), templates, given)
+    return run(plan, numbers, joint_poses(joints), templates, given)
 
 
 def joint_poses(x: Joints) -> Clip:
     """World poses of the joints that are objects, origins at their segments' centres."""
-    at = jnp.maximum(x.at, 0)
-    world = world_transforms(x.rotations, x.moving, x.offsets, x.parents, x.translated)[at]
-    q, t = jnp.moveaxis(world[:, :4], 1, 0), jnp.moveaxis(world[:, 4:], 1, 0)
-    t = t + rotate(q, jnp.broadcast_to(x.centers.T[:, :, None], t.shape))
+    world = world_transforms(x.rotations, x.moving, x.offsets, x.parents, x.translated)
+    q, t = (jnp.stack([w[x.at] for w in part]) for part in (world[:4], world[4:]))  # -1: the identity, the last row
+    t = jnp.stack([a + b for a, b in zip(t, rotate(q, x.centers.T[:, :, None]), strict=True)])
     return Clip(q, t, x.valid & (x.at >= 0)[:, None])

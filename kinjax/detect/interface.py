@@ -68,20 +68,12 @@ class Clip(NamedTuple):
     valid: Bool[Array, "objects frames"]
 
 
-class World(NamedTuple):
-    """World poses as they come, padded: `rotation`, `position`, and which are `valid`."""
-
-    rotation: Float[Array, "frames objects 4"]
-    position: Float[Array, "frames objects 3"]
-    valid: Bool[Array, "frames objects"]
-
-
 class Joints(NamedTuple):
     """A skeleton's motion, padded: local `rotations`, `moving` translations of the `translated` joints, which frames are
     `valid`; `at`: the joints that are objects (-1: padding), with the `centers` of their segments in their own frames."""
 
-    rotations: Float[Array, "frames joints 4"]
-    moving: Float[Array, "frames t 3"]
+    rotations: Float[Array, "joints 4 frames"]
+    moving: Float[Array, "t 3 frames"]
     valid: Bool[Array, " frames"]
     offsets: Float[Array, "joints 3"]
     parents: Int[Array, " joints"]

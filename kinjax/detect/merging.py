@@ -7,13 +7,25 @@ time order then steps over the few runs (and single line displacements), all obj
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..numerics import Bits, bits_after, bits_before, counts_at, packed_bits, safe_divide, safe_norm, true_positions
+from ..numerics import (
+    CHUNK,
+    Bits,
+    bits_after,
+    bits_before,
+    counts_at,
+    in_chunks,
+    packed_bits,
+    safe_divide,
+    safe_norm,
+    true_positions,
+)
 from ..rotations import cross, dot
 from .instantaneous import LINE, NONE, POINT, SPACE
 
@@ -33,7 +45,6 @@ class Elements(NamedTuple):
     """What the scan steps over, (capacity, objects): kind, first and last displacement, where it begins and ends, its axis.
 
     `fails` and `gone`: failing valid, and invalid, displacements before the first and up to the last one (two rows each).
-    `overflow` (objects,): how many elements there are in all; more than the capacity means that some are not here.
     """
 
     kind: Int[Array, "capacity objects"]
@@ -44,7 +55,10 @@ class Elements(NamedTuple):
     axis: Float[Array, "3 capacity objects"]
     fails: Int[Array, "2 capacity objects"]
     gone: Int[Array, "2 capacity objects"]
-    total: Int[Array, " objects"]
+
+
+Find = Callable[[Any, int], Elements]
+"""Elements by the number of the first one and how many are wanted."""
 
 
 class Spans(NamedTuple):
@@ -100,45 +114,81 @@ def elements(
     start: Float[Array, "3 objects n"],
     stop: Float[Array, "3 objects n"],
     axis: Float[Array, "3 objects n"] | None,
-    capacity: int,
-) -> Elements:
-    """What lies between each begin and end of `bounds`, in time order.
+) -> tuple[Find, Int[Array, " objects"]]:
+    """What lies between each begin and end of `bounds`, in time order: a function of the first one's number and of how many,
+    since fetching all that there is room for costs more than the few that there are; and their number.
 
     counted: displacements that make a gap longer when they carry no constraint. missing: those that were not seen.
     start, stop: where a displacement's constraint lies at its begin and at its end.
     """
     n = kind.shape[-1]
-    first, total = true_positions(bounds[0], capacity)
-    last, _ = true_positions(bounds[1], capacity)
     failed, lost = packed_bits(counted & (kind == NONE)), packed_bits(missing)
-    real = first < n
-    i, j = jnp.minimum(first, n - 1), jnp.minimum(last, n - 1)
 
     def take(x: Array, at: Array) -> Array:
-        return jnp.take_along_axis(x, at, axis=-1)
+        return jnp.take_along_axis(x, at, axis=-1).T
 
     def take3(x: Array, at: Array) -> Array:
-        return jnp.take_along_axis(x, jnp.broadcast_to(at, (3, *at.shape)), axis=-1)
+        return jnp.stack([take(row, at) for row in x])
 
-    lanes = lambda x: jnp.moveaxis(x, -1, -2)  # noqa: E731  (objects, capacity) -> (capacity, objects)
-    return Elements(
-        lanes(jnp.where(real, take(kind, i), NONE)),
-        lanes(i),
-        lanes(j),
-        lanes(take3(start, i)),
-        lanes(take3(stop, j)),
-        lanes(take3(axis, i) if axis is not None else jnp.zeros((3, *i.shape), start.dtype)),
-        lanes(jnp.stack([counts_at(failed, i), counts_at(failed, j)])),
-        lanes(jnp.stack([counts_at(lost, i), counts_at(lost, j)])),
-        total,
-    )
+    def find(begin: int | Int[Array, ""], most: int) -> Elements:
+        first, _ = true_positions(bounds[0], most, begin)
+        last, _ = true_positions(bounds[1], most, begin)
+        i, j = jnp.minimum(first, n - 1), jnp.minimum(last, n - 1)
+        return Elements(
+            jnp.where((first < n).T, take(kind, i), NONE),
+            i.T,
+            j.T,
+            take3(start, i),
+            take3(stop, j),
+            take3(axis, i) if axis is not None else jnp.zeros((3, *i.T.shape), start.dtype),
+            jnp.stack([counts_at(failed, i).T, counts_at(failed, j).T]),
+            jnp.stack([counts_at(lost, i).T, counts_at(lost, j).T]),
+        )
+
+    return find, jnp.sum(jax.lax.population_count(bounds[0]), axis=-1, dtype=jnp.int32)
 
 
-def merge(items: Elements, tolerance: Tolerance, lines: bool) -> Spans:
-    """The pass in time order: each element joins the open constraint or closes it. `lines=False` drops what only lines need."""
-    objects = items.kind.shape[1]
-    dtype = items.start.dtype
-    zero3 = jnp.zeros((3, objects), dtype)
+def merge(find: Find, total: Int[Array, " objects"], capacity: int, tolerance: Tolerance, lines: bool) -> Spans:
+    """The pass in time order: each element joins the open constraint or closes it. `lines=False`: all are space.
+
+    Of more than `capacity` elements the first ones.
+    """
+    most = jnp.max(total, initial=0)
+    return (_merged_in_order if lines else _merged_rests)(find, most, total.shape[0], capacity, tolerance)
+
+
+def _merged_rests(find: Find, most: Int[Array, ""], objects: int, capacity: int, tolerance: Tolerance) -> Spans:
+    """Rests only: whether one joins the rest before it depends on these two alone, so nothing has to wait for anything."""
+    zero = jnp.zeros((1, objects), jnp.int32)
+
+    def chunk(before: tuple[Array, ...], first: Int[Array, ""]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        items = find(first, CHUNK)
+        new = items.kind != NONE, items.fails[1], items.gone[1], *items.stop
+        some, fails, gone, *at = (jnp.concatenate([b, x[:-1]]) for b, x in zip(before, new, strict=True))
+        gap = items.fails[0] - fails
+        distance = safe_norm(items.start - jnp.stack(at), axis=0)
+        joins = some & (items.gone[0] - gone <= tolerance.max_missing) & (distance <= tolerance.max_jump)
+        joins &= gap <= frame_tolerance(distance, tolerance.max_gap, tolerance.max_jump)
+        return tuple(x[-1:] for x in new), (new[0], joins, items.first, items.last)
+
+    start = (zero > 0, zero, zero, *(jnp.zeros((1, objects), tolerance.max_jump.dtype),) * 3)
+    real, joins, first, last = in_chunks(chunk, start, capacity, most)[1]
+    follows = jnp.concatenate([(real & joins)[1:], jnp.zeros((1, objects), bool)])
+    begins, ends = packed_bits((real & ~joins).T), packed_bits((real & ~follows).T)
+
+    def pick(state: None, at: Int[Array, ""]) -> tuple[None, Spans]:
+        (begin, total), (end, _) = true_positions(begins, CHUNK, at), true_positions(ends, CHUNK, at)
+        begin, end = (jnp.minimum(x, capacity - 1).T for x in (begin, end))
+        used = (at + jnp.arange(CHUNK, dtype=jnp.int32))[:, None] < total
+        span = (jnp.take_along_axis(x, i, axis=0) for x, i in ((first, begin), (last, end)))
+        return state, Spans(jnp.where(used, jnp.int32(SPACE), jnp.int32(NONE)), *span)
+
+    return in_chunks(pick, None, capacity, most)[1]
+
+
+def _merged_in_order(find: Find, most: Int[Array, ""], objects: int, capacity: int, tolerance: Tolerance) -> Spans:
+    """Lines among them: what a constraint has become decides what joins it."""
+    zero3 = jnp.zeros((3, objects), tolerance.max_jump.dtype)
     zero = jnp.zeros(objects, jnp.int32)
 
     def step(open_: Any, new: Any) -> tuple[Any, Any]:
@@ -150,24 +200,22 @@ def merge(items: Elements, tolerance: Tolerance, lines: bool) -> Spans:
         distance = safe_norm(apart, axis=0)
         reach = gap <= frame_tolerance(distance, tolerance.max_gap, tolerance.max_jump)
         joins = (kind == SPACE) & (n_kind == SPACE) & reach & (distance <= tolerance.max_jump)
-        becomes, point = jnp.full_like(kind, SPACE), n_stop
-        if lines:
-            normal = cross(axis, n_axis)
-            sine = safe_norm(normal, axis=0)
-            parallel = jnp.arctan2(sine, jnp.abs(dot(axis, n_axis))) < tolerance.alpha_max
-            beside = safe_norm(cross(apart, axis), axis=0)
-            skew = jnp.abs(safe_divide(dot(apart, normal), sine))
-            # feet of the common perpendicular of two lines that are not parallel
-            s = safe_divide(dot(cross(apart, n_axis), normal), sine**2)
-            u = safe_divide(dot(cross(apart, axis), normal), sine**2)
-            crossing = (at + s * axis + n_start + u * n_axis) / 2
-            from_point = safe_norm(cross(apart, n_axis), axis=0)
-            d = jnp.where(kind == POINT, from_point, jnp.where(parallel, beside, skew))
-            near = (d <= tolerance.dist_max) & (gap <= frame_tolerance(d, tolerance.max_gap, tolerance.max_jump))
-            joins |= ((kind == LINE) | (kind == POINT)) & (n_kind == LINE) & near
-            meets = (kind == POINT) | ((kind == LINE) & ~parallel)
-            becomes = jnp.where(n_kind == SPACE, SPACE, jnp.where(meets, POINT, LINE))
-            point = jnp.where(kind == POINT, at, jnp.where((n_kind == LINE) & meets, crossing, n_stop))
+        normal = cross(axis, n_axis)
+        sine = safe_norm(normal, axis=0)
+        parallel = jnp.arctan2(sine, jnp.abs(dot(axis, n_axis))) < tolerance.alpha_max
+        beside = safe_norm(cross(apart, axis), axis=0)
+        skew = jnp.abs(safe_divide(dot(apart, normal), sine))
+        # feet of the common perpendicular of two lines that are not parallel
+        s = safe_divide(dot(cross(apart, n_axis), normal), sine**2)
+        u = safe_divide(dot(cross(apart, axis), normal), sine**2)
+        crossing = (at + s * axis + n_start + u * n_axis) / 2
+        from_point = safe_norm(cross(apart, n_axis), axis=0)
+        d = jnp.where(kind == POINT, from_point, jnp.where(parallel, beside, skew))
+        near = (d <= tolerance.dist_max) & (gap <= frame_tolerance(d, tolerance.max_gap, tolerance.max_jump))
+        joins |= ((kind == LINE) | (kind == POINT)) & (n_kind == LINE) & near
+        meets = (kind == POINT) | ((kind == LINE) & ~parallel)
+        becomes = jnp.where(n_kind == SPACE, SPACE, jnp.where(meets, POINT, LINE))
+        point = jnp.where(kind == POINT, at, jnp.where((n_kind == LINE) & meets, crossing, n_stop))
         joins &= connected
         real = n_kind != NONE
         closes = real & ~joins
@@ -183,53 +231,25 @@ def merge(items: Elements, tolerance: Tolerance, lines: bool) -> Spans:
         )
         return state, out
 
-    xs = (
-        items.kind,
-        items.first,
-        items.last,
-        jnp.moveaxis(items.start, 1, 0),
-        jnp.moveaxis(items.stop, 1, 0),
-        jnp.moveaxis(items.axis, 1, 0),
-        jnp.moveaxis(items.fails, 1, 0),
-        jnp.moveaxis(items.gone, 1, 0),
-    )
+    def chunk(state: Any, first: Int[Array, ""]) -> tuple[Any, Any]:
+        items = find(first, CHUNK)
+        along = *items[:3], *(jnp.moveaxis(x, 1, 0) for x in items[3:])
+        return jax.lax.scan(step, state, along)
+
     start = (jnp.full_like(zero, NONE), zero, zero, zero3, zero3, zero, zero)
-    state, out = scan_as_far(step, start, xs, jnp.max(items.total, initial=0))
-    return packed(Spans(*(jnp.concatenate([o, s[None]]) for o, s in zip(out, state[:3], strict=True))))
+    state, out = in_chunks(chunk, start, capacity, most)
+    return packed(Spans(*(jnp.concatenate([o, s[None]]) for o, s in zip(out, state[:3], strict=True))), most)
 
 
-CHUNK = 32
-"""Steps that `scan_as_far` takes at once."""
+def packed(spans: Spans, count: Int[Array, ""]) -> Spans:
+    """Empty slots last, order kept; at most `count` are used, and the last slot goes: there is one more than elements."""
+    slots = spans.kind.shape[0] - 1
+    used = packed_bits(spans.kind.T != NONE)
 
+    def chunk(state: None, first: Int[Array, ""]) -> tuple[None, Spans]:
+        at, total = true_positions(used, CHUNK, first)
+        kind, begin, end = (jnp.take_along_axis(x, jnp.minimum(at, slots).T, axis=0) for x in spans)
+        rank = first + jnp.arange(CHUNK, dtype=jnp.int32)
+        return state, Spans(jnp.where(rank[:, None] < total, kind, NONE), begin, end)
 
-def scan_as_far(step: Any, start: Any, xs: Any, count: Int[Array, ""]) -> tuple[Any, Any]:
-    """`jax.lax.scan` over the first `count` elements (rounded up to a chunk): room for many costs nothing where there are few.
-
-    What lies beyond is not visited; its outputs are 0.
-    """
-    capacity = jax.tree.leaves(xs)[0].shape[0]
-    if capacity % CHUNK:
-        return jax.lax.scan(step, start, xs)
-    chunks = jax.tree.map(lambda x: x.reshape(-1, CHUNK, *x.shape[1:]), xs)
-    one = jax.tree.map(lambda x: x[0], chunks)
-    like = jax.eval_shape(lambda s, x: jax.lax.scan(step, s, x)[1], start, one)
-    out = jax.tree.map(lambda y: jnp.zeros((capacity // CHUNK, *y.shape), y.dtype), like)
-
-    def chunk(i: Int[Array, ""], carried: Any) -> Any:
-        state, out = carried
-        here = jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, i, 0, keepdims=False), chunks)
-        state, new = jax.lax.scan(step, state, here)
-        return state, jax.tree.map(lambda o, n: jax.lax.dynamic_update_index_in_dim(o, n, i, 0), out, new)
-
-    needed = jnp.minimum((count + CHUNK - 1) // CHUNK, capacity // CHUNK)
-    state, out = jax.lax.fori_loop(0, needed, chunk, (start, out))
-    return state, jax.tree.map(lambda y: y.reshape(capacity, *y.shape[2:]), out)
-
-
-def packed(spans: Spans) -> Spans:
-    """Empty slots last, order kept."""
-    slots = spans.kind.shape[0]
-    at, total = true_positions(packed_bits(spans.kind.T != NONE), slots)
-    at = jnp.minimum(at, slots - 1).T
-    kind, first, last = (jnp.take_along_axis(x, at, axis=0) for x in spans)
-    return Spans(jnp.where(jnp.arange(slots, dtype=jnp.int32)[:, None] < total, kind, NONE), first, last)
+    return in_chunks(chunk, None, slots, count)[1]

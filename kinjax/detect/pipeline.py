@@ -11,7 +11,6 @@ from dataclasses import replace
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ..annotations import NoisePattern, Template
@@ -19,9 +18,9 @@ from ..errors import OptionError
 from ..motion import Motion, Poses
 from ..numerics import BLOCK, bucket
 from .engine import joint_poses, run_joints, run_poses
-from .interface import Found, Joints, Plan, World
+from .interface import Clip, Found, Joints, Plan
 from .planning import capacity_of, given_patterns, numbers, pivot_patterns, plan_of, template_spans
-from .prepare import Prepared, padded_world, prepared
+from .prepare import Prepared, padded_clip, prepared
 from .records import detection, kinds_of, pattern_records, unit_of
 from .results import Detection
 from .settings import Settings
@@ -146,11 +145,7 @@ def _run(
         plan = replace(plan, capacity=1 << (needed - 1).bit_length())
 
 
-@jax.jit
-def _world(joints: Joints) -> World:
-    clip = joint_poses(joints)
-    rotation, position = (jnp.swapaxes(jnp.moveaxis(x, 0, -1), 0, 1) for x in (clip.q, clip.t))
-    return World(rotation, position, clip.valid.T)
+_world = jax.jit(joint_poses)
 
 
 def _side_by_side(clips: Sequence[Prepared]) -> tuple[Prepared, list[tuple[int, int]]]:
@@ -159,15 +154,15 @@ def _side_by_side(clips: Sequence[Prepared]) -> tuple[Prepared, list[tuple[int, 
     counts = [len(c.names) for c in clips]
     ends = np.cumsum(counts)
     longest = max(c.frames for c in clips)
-    poses = [c.arrays if isinstance(c.arrays, World) else jax.device_get(_world(c.arrays)) for c in clips]
-    parts = [[x[:longest, :n] for x in p] for p, n in zip(poses, counts, strict=True)]
-    arrays = padded_world(*(np.concatenate(x, axis=1) for x in zip(*parts, strict=True)))
+    poses = [c.arrays if isinstance(c.arrays, Clip) else jax.device_get(_world(c.arrays)) for c in clips]
+    parts = [[x[..., :n, :longest] for x in p] for p, n in zip(poses, counts, strict=True)]
+    arrays = padded_clip(*(np.concatenate(x, axis=-2) for x in zip(*parts, strict=True)))
     batch = replace(
         clips[0],
         arrays=arrays,
-        valid=np.asarray(arrays.valid)[:longest, : ends[-1]].T,
+        valid=np.asarray(arrays.valid)[: ends[-1], :longest],
         origin=np.concatenate([c.origin for c in clips]),
-        lanes=arrays.valid.shape[1],
+        lanes=arrays.valid.shape[0],
         names=names,
         frames=longest,
         clip="batch",

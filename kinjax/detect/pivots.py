@@ -62,7 +62,7 @@ def merged_pivots(
     windows = best_segmentation(rewards, lengths[0])
     kind = jnp.where(windows.inside, LINE, NONE)
     nowhere = jnp.zeros_like(t)
-    items = elements(
+    find, total = elements(
         kind,
         (packed_bits(windows.is_first), packed_bits(windows.is_last)),
         valid,
@@ -70,8 +70,8 @@ def merged_pivots(
         nowhere,
         nowhere,
         None,
-        capacity,
     )
+    items = find(0, capacity)
     spans = _merged(q, t, valid, items.kind != NONE, items.first, items.last, reward, rate)
     used = spans.kind != NONE
     moments, origin = span_moments(q, t, valid, spans.first, spans.last, used)
@@ -81,7 +81,7 @@ def merged_pivots(
     if not free:
         used &= _touching(spans, used, space, jnp.asarray(TOUCH, dtype) * rate)
     kind = jnp.where(used, jnp.where(found.is_line, LINE, POINT), NONE)
-    return (kind, spans.first, spans.last, found.point + origin, found.axis, found.residual), items.total
+    return (kind, spans.first, spans.last, found.point + origin, found.axis, found.residual), total
 
 
 def template_noise(
@@ -148,7 +148,8 @@ def _merged(
     xs = (used, first, last, jnp.moveaxis(origin, 1, 0), jax.tree.map(lambda m: jnp.moveaxis(m, -2, 0), moments))
     state, out = jax.lax.scan(step, start, xs)
     kind = jnp.concatenate([out[0], jnp.where(state[0], LINE, NONE)[None]])
-    return packed(Spans(kind, *(jnp.concatenate([o, s[None]]) for o, s in zip(out[1:], state[1:3], strict=True))))
+    spans = Spans(kind, *(jnp.concatenate([o, s[None]]) for o, s in zip(out[1:], state[1:3], strict=True)))
+    return packed(spans, jnp.max(jnp.sum(used, axis=0, dtype=jnp.int32), initial=0))
 
 
 def _touching(spans: Spans, used: Array, space: tuple[Array, ...], touch: Array) -> Bool[Array, "slots objects"]:

@@ -18,7 +18,7 @@ from ..errors import OptionError, ShapeError, find_name
 from ..kinematics import object_poses
 from ..motion import Motion, Poses
 from ..numerics import BLOCK, bucket
-from .interface import Joints, World
+from .interface import Clip, Joints
 from .settings import Settings
 
 
@@ -27,7 +27,7 @@ class Prepared:
     """One clip, ready to run: what the engine takes (NumPy arrays), `valid` (objects, frames) without padding, and the
     `origin` (objects, 3) to be added to the positions that come out."""
 
-    arrays: World | Joints
+    arrays: Clip | Joints
     valid: np.ndarray
     origin: np.ndarray
     lanes: int
@@ -134,12 +134,12 @@ def prepared(
     if not valid.all():
         seen = valid.T[..., None]
         rotation, position = np.where(seen, rotation, [1, 0, 0, 0]), np.where(seen, position, 0.0)
-    world = padded_world(rotation, position, valid.T)
+    world = padded_clip(rotation.T, position.T, valid)
     return Prepared(
         world,
         valid,
         origin,
-        world.valid.shape[1],
+        world.valid.shape[0],
         poses.names,
         poses.frames,
         float(poses.rate),
@@ -155,17 +155,17 @@ def check_rate(rate: float) -> None:
         raise OptionError(f"rate is {rate}: it must be a positive number of frames a second")
 
 
-def padded_world(rotation: np.ndarray, position: np.ndarray, valid: np.ndarray) -> World:
-    """Poses (frames, objects, ...) in the working precision, padded with unseen identity poses."""
-    frames, objects = valid.shape
+def padded_clip(rotation: np.ndarray, position: np.ndarray, valid: np.ndarray) -> Clip:
+    """Poses (..., objects, frames) in the working precision, padded with unseen identity poses."""
+    objects, frames = valid.shape
     lanes, length, dtype = 1 << (objects - 1).bit_length(), bucket(frames + BLOCK), working_dtype()
     out: tuple[Any, ...] = tuple(
-        np.zeros((length, lanes, *n), k) for n, k in (((4,), dtype), ((3,), dtype), ((), np.bool_))
+        np.zeros((*n, lanes, length), k) for n, k in (((4,), dtype), ((3,), dtype), ((), np.bool_))
     )
     for whole, part in zip(out, (rotation, position, valid), strict=True):
-        whole[:frames, :objects] = part
-    out[0][frames:, :, 0] = out[0][:, objects:, 0] = 1
-    return World(*out)
+        whole[..., :objects, :frames] = part
+    out[0][0, :, frames:] = out[0][0, objects:] = 1
+    return Clip(*out)
 
 
 def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool) -> Prepared:
@@ -190,17 +190,19 @@ def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool) 
     if len(joints) < q.shape[1]:
         q = q[:, joints]
     t = np.asarray(t[:, [k for k, _ in moving]], float)
-    valid: Any = np.isfinite(q).all((1, 2)) & np.isfinite(t).all((1, 2))
+    valid: Any = np.ones(frames, bool)
+    if not (np.isfinite(q).all() and np.isfinite(t).all()):  # frame by frame takes three times as long
+        valid = np.isfinite(q).all((1, 2)) & np.isfinite(t).all((1, 2))
     root = np.array([top.parents[j] < 0 for _, j in moving])
     origin = t[np.argmax(valid), int(np.argmax(root))] if near and valid.any() and root.any() else np.zeros(3)
     t = t - root[:, None] * origin
     if not valid.all():
         q, t = np.where(valid[:, None, None], q, [1, 0, 0, 0]), np.where(valid[:, None, None], t, 0)
-    rotations = np.zeros((length, room, 4), dtype)
-    rotations[:frames, : len(joints)] = q
-    rotations[frames:, :, 0] = rotations[:, len(joints) :, 0] = 1
-    translations = np.zeros((length, len(moving), 3), dtype)
-    translations[:frames] = t
+    rotations = np.zeros((room, 4, length), dtype)
+    rotations[: len(joints), :, :frames] = q.transpose(1, 2, 0)
+    rotations[:, 0, frames:] = rotations[len(joints) :, 0] = 1
+    translations = np.zeros((len(moving), 3, length), dtype)
+    translations[..., :frames] = t.transpose(1, 2, 0)
     mask = np.zeros(length, bool)
     mask[:frames] = valid
     offsets = np.zeros((room, 3), dtype)

@@ -65,11 +65,12 @@ def detection(
     index: dict[tuple[str, str], int] = {
         (p.object.casefold(), p.type): i for i, p in reversed(list(enumerate(records)))
     }
-    types = ("space", "line", "point")
-    which = [
-        index.get((clip.names[o].casefold(), types[k - 1]), index.get((clip.names[o].casefold(), "line"), 0))
-        for o, k in zip(lane, kind, strict=True)
-    ]
+    which = np.array(
+        [
+            [index.get((name, k), index.get((name, "line"), 0)) for k in ("space", "line", "point")]
+            for name in map(str.casefold, clip.names)
+        ]
+    )
     segments = Segments(
         lane.astype(int),
         kind - 1,
@@ -78,14 +79,15 @@ def detection(
         host.position[:, slot, lane].T.astype(float) + clip.origin[lane],
         host.axis[:, slot, lane].T,
         host.residual[slot, lane],
-        np.asarray(which, int),
+        which[lane, kind - 1],
     )
     kinds: tuple[Any, ...] = kinds_of(plan)[: len(host.limits)]
     middle = (np.arange(n) + (0.5 if settings.method == "paper" else plan.span / 2)) * scale
-    template = np.zeros((n, objects), int)
-    for m in host.marks:
-        template = np.maximum(template, cut(m))
-    missing = (~clip.valid).sum(1) + host.missing[:objects]
+    template = np.zeros((objects, n), int)
+    if templates:
+        for m in host.marks:
+            np.maximum(template, m[:objects, :n], out=template)
+    absent = clip.frames - np.count_nonzero(clip.valid, axis=1)
     return Detection(
         middle,
         cut(host.sigma_3),
@@ -94,10 +96,10 @@ def detection(
         cut(host.eps_1),
         cut(host.valid),
         cut(host.passed),
-        template,
+        template.T,
         {k: cut(v[0]) for k, v in zip(kinds, host.limits, strict=True)},
         {k: cut(v[1]) for k, v in zip(kinds, host.limits, strict=True)},
-        missing,
+        absent + host.missing[:objects],
         segments,
         tuple(records),
         clip.original_rate,
@@ -106,7 +108,7 @@ def detection(
         clip.clip,
         unit_of(settings),
         settings,
-        tuple(_warnings(clip, records, np.asarray(host.missing)[:objects])),
+        tuple(_warnings(clip, records, absent, np.asarray(host.missing)[:objects])),
     )
 
 
@@ -184,14 +186,14 @@ def pattern_records(
     return tuple(out)
 
 
-def _warnings(clip: Prepared, patterns: Sequence[NoisePattern], spikes: np.ndarray) -> list[str]:
+def _warnings(clip: Prepared, patterns: Sequence[NoisePattern], absent: np.ndarray, spikes: np.ndarray) -> list[str]:
     """What a person should know, in words. A stray spike is no news; more than one frame in fifty is."""
     out = []
     for p in patterns:
         out += [f"{p.object} ({p.type}): {_WORDS[s]}" for s in p.status.split("+") if s in _WORDS]
-    for name, seen, spiky in zip(clip.names, clip.valid, spikes, strict=True):
-        if not seen.all():
-            out.append(f"{name}: {int((~seen).sum())} of {clip.frames} frames are missing; they were masked")
+    for name, unseen, spiky in zip(clip.names, absent, spikes, strict=True):
+        if unseen:
+            out.append(f"{name}: {unseen} of {clip.frames} frames are missing; they were masked")
         if spiky * 50 > clip.frames:
             out.append(f"{name}: {int(spiky)} of {clip.frames} frames were rejected as spikes")
     return out

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..numerics import running_count, running_sum, safe_divide, safe_norm, safe_sqrt
+from ..numerics import CHUNK, in_chunks, running_count, running_sum, safe_divide, safe_norm, safe_sqrt
 from ..rotations import apply, apply_transposed, dot, matrix
 
 
@@ -106,34 +106,50 @@ def span_places(
     Each frame's origin is a running sum of the steps from one span's first place to the next one's.
     """
     objects, frames = valid.shape
-    lane = jnp.broadcast_to(jnp.arange(objects, dtype=jnp.int32), begin.shape)
-    first, last = jnp.where(used, begin, frames), jnp.where(used, end, frames)
-    marks = (
-        jnp.zeros((objects, frames), t.dtype).at[lane, first].add(1, mode="drop").at[lane, last].add(-1, mode="drop")
-    )
-    inside = valid & (running_sum(marks) > 0.5)
-    place = jnp.where(used.T, _at(t, jnp.where(used, begin, 0)), 0)  # (3, objects, spans)
-    step = jnp.where(used.T, place - jnp.concatenate([jnp.zeros_like(place[..., :1]), place[..., :-1]], -1), 0)
-    steps = [jnp.zeros((objects, frames), t.dtype).at[lane, first].add(s.T, mode="drop") for s in step]
-    path = [running_sum(s) for s in steps]
-    d = jnp.stack([x - y for x, y in zip(t, path, strict=True)])
+    slots, nothing = begin.shape[0], jnp.zeros((objects, frames), t.dtype)
     begins, ends = jnp.where(used, begin, 0), jnp.where(used, end, 0)
+    before = jnp.concatenate([begins[:1], begins])[:slots]  # where the span before begins
+    count = jnp.max(jnp.sum(used, axis=0, dtype=jnp.int32), initial=0)
+    lane = jnp.broadcast_to(jnp.arange(objects, dtype=jnp.int32), (CHUNK, objects))
+    rows = lambda x, first: jax.lax.dynamic_slice_in_dim(x, first, CHUNK, 0)  # noqa: E731
 
-    def between(x: Array) -> Array:
-        """Sum over the frames of each span but its last."""
-        sums = running_sum(jnp.where(inside, x, 0))
-        before = jnp.where(begins.T > 0, _at(sums, jnp.maximum(begins - 1, 0)), 0)
-        return jnp.where(used.T, _at(sums, jnp.maximum(ends - 1, 0)) - before, 0)
+    def mark(carried: tuple[Array, ...], at: Int[Array, ""]) -> tuple[tuple[Array, ...], None]:
+        marks, *steps = carried
+        here, earlier, real = rows(begins, at), rows(before, at), rows(used, at)
+        first, last = jnp.where(real, here, frames), jnp.where(real, rows(ends, at), frames)
+        marks = marks.at[lane, first].add(1, mode="drop").at[lane, last].add(-1, mode="drop")
+        is_first = (at + jnp.arange(CHUNK, dtype=jnp.int32) == 0)[:, None]
+        for i, x in enumerate(t):
+            step = jnp.where(real, _at(x, here).T - jnp.where(is_first, 0, _at(x, earlier).T), 0)
+            steps[i] = steps[i].at[lane, first].add(step, mode="drop")
+        return (marks, *steps), None
 
-    total = jnp.stack([between(x) for x in (jnp.ones_like(t[0]), *d, dot(d, d))])
-    origin = jnp.stack([_at(x, begins) for x in path])
-    end_d = _at(t, ends) - origin  # the last frame may be the next span's first
-    end_row = jnp.concatenate([jnp.ones_like(end_d[:1]), end_d, dot(end_d, end_d)[None]])
-    total = total + jnp.where(_at(valid, ends), end_row, 0)
-    n = jnp.maximum(total[0], 1)
-    center = total[1:4] / n
-    spread = safe_sqrt(jnp.maximum(total[4] / n - dot(center, center), 0))
-    return Place(jnp.swapaxes(center + origin, -1, -2), spread.T)
+    (marks, *steps), _ = in_chunks(mark, (nothing,) * 4, slots, count)
+    inside = valid & (running_sum(marks) > 0.5)
+    path = [running_sum(s) for s in steps]
+    d = [x - y for x, y in zip(t, path, strict=True)]
+    sums = [running_sum(jnp.where(inside, x, 0)) for x in (jnp.ones_like(t[0]), *d, dot(d, d))]
+
+    def place(state: None, at: Int[Array, ""]) -> tuple[None, tuple[Array, ...]]:
+        first, last, real = rows(begins, at), rows(ends, at), rows(used, at)
+        origin = [_at(x, first).T for x in path]
+        end_d = [_at(x, last).T - o for x, o in zip(t, origin, strict=True)]
+        ending = jnp.ones_like(origin[0]), *end_d, dot(end_d, end_d)  # the last frame may be the next span's first
+        seen = _at(valid, last).T
+
+        def total(sums: Array, ending: Array) -> Array:
+            earlier = jnp.where(first > 0, _at(sums, jnp.maximum(first - 1, 0)).T, 0)
+            between = jnp.where(real, _at(sums, jnp.maximum(last - 1, 0)).T - earlier, 0)
+            return between + jnp.where(seen, ending, 0)
+
+        n, *moments, square = (total(x, y) for x, y in zip(sums, ending, strict=True))
+        n = jnp.maximum(n, 1)
+        center = [x / n for x in moments]
+        spread = safe_sqrt(jnp.maximum(square / n - dot(center, center), 0))
+        return state, (*(x + o for x, o in zip(center, origin, strict=True)), spread)
+
+    *center, spread = in_chunks(place, None, slots, count)[1]
+    return Place(jnp.stack(center), spread)
 
 
 def span_moments(
