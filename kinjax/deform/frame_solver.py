@@ -28,6 +28,9 @@ from .chain import Chain, Pose, World, compose, forward, inverse_of, moved, pare
 from .prioritized import factorize, layered_step, outside, times
 from .tasks import CENTER_OF_MASS, Goals, Kinds, Tasks, jacobian, look, residuals
 
+PULLS = (1.0, 0.25)
+"""Shares of the attraction (of as much of it as is trusted) that are tried."""
+
 
 class Solving(NamedTuple):
     """Numbers of the solver (metres and radians): see `settings.Settings`."""
@@ -36,7 +39,7 @@ class Solving(NamedTuple):
     budget: float = 1.0
     damping: float = 0.3
     damped_error: float = 0.05
-    slack: float = 1e-6
+    slack: float = 1e-7
     slack_ratio: float = 1e-4
     tolerance: float = 1e-5
     iterations: int = 10
@@ -73,6 +76,7 @@ class State(NamedTuple):
     more to gain). rank: (N,) freedoms that each layer took. Those three are of the pose before the last step. stayed: no
     candidate was better than the pose as it was. travel: (n,) the steps since the frame began, all together. trust:
     (N,) how much of its clamp each layer asks for: one that was refused asks for less the next time.
+    pull: how much of the attraction is asked for, so that what it costs the constraints stays within its slack.
     """
 
     pose: Pose
@@ -87,6 +91,7 @@ class State(NamedTuple):
     own: Float[Array, " layers"]
     travel: Float[Array, " n"]
     trust: Float[Array, " layers"]
+    pull: Float[Array, ""]
 
 
 class Attempt(NamedTuple):
@@ -118,10 +123,11 @@ def solve_frame(
     solving: Solving,
     kinds: Kinds,
     trust: Float[Array, " layers"],
+    pull: Float[Array, ""],
 ) -> State:
     """Iterate from `start` until nothing is gained, `solving.iterations` times at most in each run."""
     step = _Iteration(chain, tasks, goals, offsets, reference, layers, solving, kinds)
-    first = step.begin(start, trust)
+    first = step.begin(start, trust, pull)
     # layers below the last active one are not there
     every = 1 + jnp.max(jnp.where(goals.active > 0, tasks.layer, -1)).astype(jnp.int32)
     free = jnp.full_like(first.errors, jnp.inf)
@@ -177,7 +183,7 @@ class _Iteration:
         r = r.reshape(-1, r.shape[-1])
         return world, r, safe_sqrt(times(self.members, r * r))
 
-    def begin(self, pose: Pose, trust: Float[Array, " layers"]) -> State:
+    def begin(self, pose: Pose, trust: Float[Array, " layers"], pull: Float[Array, ""]) -> State:
         """The state before the first iteration; done where nothing is asked, or where it is not finite."""
         world, r, errors = self.evaluate(pose)
         dtype = r.dtype
@@ -194,6 +200,7 @@ class _Iteration:
             jnp.ones(self.layers, dtype),
             jnp.zeros(3 + 3 * self.offsets.shape[0], dtype),
             trust,
+            pull,
         )
 
     def iterate(self, s: State, depth: Int[Array, ""], caps: Float[Array, " layers"]) -> State:
@@ -212,13 +219,16 @@ class _Iteration:
         parent = parent_rotations(self.chain, s.world)
         z = outside(factors.basis, attraction(self.reference, s.pose, parent))
         z = z * jnp.minimum(1, safe_divide(safe_sqrt(solving.budget**2 - y @ y), safe_sqrt(z @ z)))
-        # candidates: all layers with z, then all without it, all but the last, ..., the first alone
-        last = jnp.concatenate([jnp.full((1,), layers, jnp.int32), jnp.arange(layers, 0, -1, dtype=jnp.int32)])
-        posture = (jnp.arange(layers + 1, dtype=jnp.int32) == 0).astype(jac.dtype)
+        # candidates: all layers with z, with less of it, then all without it, all but the last, ..., the first alone
+        pulls = len(PULLS)
+        last = jnp.concatenate([jnp.full((pulls,), layers, jnp.int32), jnp.arange(layers, 0, -1, dtype=jnp.int32)])
+        posture = jnp.concatenate([s.pull * jnp.asarray(PULLS, jac.dtype), jnp.zeros(layers, jac.dtype)])
         use = (rows[:, None] < last[None, :]).astype(jac.dtype)
         expected = r0[:, None] - times(factors.basis.factors, y[:, None] * use)
         # the layers above the last of a candidate (all of them, under posture) take back what the step's curvature did
-        mend = (rows[:, None] < jnp.maximum(last - 1 + posture.astype(jnp.int32), 1)[None, :]).astype(jac.dtype)
+        mend = (
+            rows[:, None] < jnp.maximum(last - (jnp.arange(layers + pulls) >= pulls).astype(jnp.int32), 1)[None, :]
+        ).astype(jac.dtype)
         fix = partial(correct, clamp=solving.clamp)
 
         below = jnp.arange(layers, dtype=jnp.int32)[:, None] >= depth
@@ -238,21 +248,29 @@ class _Iteration:
         def unsettled(tried: Tried) -> Bool[Array, ""]:
             # one correction where the step was curved, a second where all layers together, posture apart, are still refused
             curved = jnp.max(jnp.abs(wrong(tried.residual))) > 0.1 * solving.slack
-            return (tried.times < 1) | (curved & ((tried.times < 2) | ((tried.times < 3) & (tried.best > 1))))
+            return (tried.times < 1) | (curved & ((tried.times < 2) | ((tried.times < 3) & (tried.best > pulls))))
 
         # nothing has gone wrong before the first attempt: its residuals are those expected
-        spread = jax.tree.map(lambda x: jnp.repeat(x, layers + 1, axis=-1), (s.pose, s.world))
+        spread = jax.tree.map(lambda x: jnp.repeat(x, layers + pulls, axis=-1), (s.pose, s.world))
         zero = jnp.zeros((), jnp.int32)
         none = Tried(y[:, None] * use, spread[0], spread[1], expected, s.errors[:, None] + 0 * posture, zero, zero)
         along, trial, world, r, errors, best, _ = jax.lax.while_loop(unsettled, attempt, none)
         step = times(across.T, along) + z[:, None] * posture[None, :]
-        stay = best == layers + 1
-        pick = jnp.minimum(best, layers)
+        everything = jnp.concatenate([errors, s.errors[:, None]], axis=1)
+        stay = best == layers + pulls
+        pick = jnp.minimum(best, layers + pulls - 1)
 
         def take(x: Array, old: Array) -> Array:
             return jnp.where(stay, old, jax.lax.dynamic_index_in_dim(x, pick, x.ndim - 1, keepdims=True))
 
         kept = take(step, jnp.zeros_like(step[:, :1]))
+        # what the whole attraction cost, and how much of it would cost half the slack (the cost grows with its square)
+        best_yet = jnp.min(everything, axis=1)
+        room = jnp.maximum(solving.slack, solving.slack_ratio * best_yet)
+        cost = jnp.max(jnp.where(below[:, 0], 0, (everything[:, 0] - best_yet) / room))
+        pull = jnp.clip(s.pull * jnp.clip(safe_sqrt(safe_divide(0.5 * jnp.ones_like(cost), cost)), 1 / 8, 2), 1e-4, 1)
+        pull = jnp.where(cost > 0, pull, jnp.minimum(2 * s.pull, 1))
+        waiting = (best >= pulls) & (s.pull > 1e-3) & (jnp.max(jnp.abs(z)) > solving.tolerance)
         solo, own = _gains(factors.basis.factors, jac, r0, rows, members)
         return State(
             jax.tree.map(take, trial, s.pose),
@@ -260,20 +278,21 @@ class _Iteration:
             take(r, s.residual.reshape(-1, 1)).reshape(-1, 3),
             take(errors, s.errors[:, None])[:, 0],
             s.iterations + 1,
-            stay | (jnp.max(jnp.abs(kept)) < solving.tolerance),
+            (stay | (jnp.max(jnp.abs(kept)) < solving.tolerance)) & ~waiting,
             stay,
             (members @ jnp.sum(across**2, axis=1)).round().astype(jnp.int32),
             solo,
             own,
             s.travel + kept[:, 0],
             self._trust(s.trust, best),
+            pull,
         )
 
     def _trust(self, trust: Float[Array, " layers"], best: Int[Array, ""]) -> Float[Array, " layers"]:
         """Twice the trust for the layers of the candidate that was kept, half for the first that was refused; what lies below
         could not be judged."""
         level = jnp.arange(self.layers, dtype=jnp.int32)
-        kept = jnp.where(best == 0, self.layers, self.layers + 1 - best)
+        kept = jnp.where(best < len(PULLS), self.layers, self.layers + len(PULLS) - best)
         less = jnp.maximum(trust / 2, 1 / 64)
         return jnp.where(level < kept, jnp.minimum(2 * trust, 1), jnp.where(level == kept, less, trust))
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..anthropometry import SegmentMasses, leg_length, segment_masses
 from ..errors import KinjaxError, OptionError, ShapeError, UnknownNameError, find_name
@@ -34,8 +34,10 @@ class Plan:
     """What the solver runs on: a `Chain`, `Tasks` and `Frames` of NumPy arrays.
 
     kept: (P',) skeleton indices of the first P' joints of the chain (the rest is padding). order: indices into the caller's
-    constraints, of the first of the tasks (the rest is padding). titles, units, layer, spans: of the caller's constraints; layer -1
-    where a constraint has weight 0. layers: how many. kinds: what the program has to be able to do.
+    constraints, of those in use; slot: the task that serves each of them; active: (F, n) when. Constraints of one kind on
+    one point that are never active together share a task: a walk has as many tasks as feet, however many steps.
+    titles, units, layer, spans: of the caller's constraints; layer -1 where a constraint has weight 0. layers: how many.
+    kinds: what the program has to be able to do.
     """
 
     chain: Any
@@ -43,6 +45,8 @@ class Plan:
     frames: Any
     kept: Int[np.ndarray, " p"]
     order: tuple[int, ...]
+    slot: tuple[int, ...]
+    active: Bool[np.ndarray, "f n"]
     titles: tuple[str, ...]
     units: tuple[str, ...]
     layer: tuple[int, ...]
@@ -189,10 +193,10 @@ def make_plan(motion: Motion, goals: Sequence[Goal], settings: Settings) -> Plan
     kept = _kept([asked[i] for i in order], top)
     chain, new = _chain(kept, motion)
     count = max(len(ranks), 1)
-    tasks, frames = _arrays(
-        [asked[i] for i in order], [layer[i] for i in order], count, kept, new, chain, body, settings
-    )
     used = [asked[i] for i in order]
+    own = [layer[i] for i in order]
+    slot = _slots(used, own)
+    tasks, frames = _arrays(used, own, slot, count, kept, new, chain, body)
     kinds = Kinds(
         any(a.kind == ORIENTATION for a in used),
         any(a.kind == LOOK_AT for a in used),
@@ -205,6 +209,8 @@ def make_plan(motion: Motion, goals: Sequence[Goal], settings: Settings) -> Plan
         frames,
         np.array(kept, int),
         order,
+        slot,
+        active[:, list(order)],
         titles,
         units,
         tuple(layer),
@@ -246,7 +252,11 @@ def _whole_bodies(goals: Sequence[Goal], asked: list[Asked], body: Body) -> list
         if body.top.parents[j] >= 0:
             carried[body.top.parents[j]] += carried[j]
     whole = frozenset(int(j) for j in np.flatnonzero(carried >= LIGHT))
-    named = [a.recruits for g, a in zip(goals, asked, strict=True) if not isinstance(g, CenterOfMass) or g.recruits is not None]
+    named = [
+        a.recruits
+        for g, a in zip(goals, asked, strict=True)
+        if not isinstance(g, CenterOfMass) or g.recruits is not None
+    ]
     whole = whole.union(*named)
     return [
         replace(a, recruits=whole) if isinstance(g, CenterOfMass) and g.recruits is None else a
@@ -430,34 +440,53 @@ def _chain(kept: list[int], motion: Motion) -> tuple[Any, dict[int, int]]:
 SIZES = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24, 28, 32)
 
 
-def _arrays(asked, layer, count, kept, new, chain, body, settings) -> tuple[Any, Any]:
-    """Tasks and frames, padded: constraints to one of `SIZES`, mass points to a multiple of four."""
-    f, p, n = body.frames, len(chain.parents), len(asked)
+def _slots(asked: Sequence[Asked], layer: Sequence[int]) -> tuple[int, ...]:
+    """The task that serves each constraint: one of its kind that is not active when it is, or a new one."""
+    taken: list[tuple[object, np.ndarray]] = []
+    slot = []
+    for a, i in zip(asked, layer, strict=True):
+        arrays = tuple(x.tobytes() for x in (a.point, a.look, a.axes))
+        key = (i, a.kind, a.joint, a.reference, a.recruits, a.support, a.goal.weight, arrays)
+        at = next(
+            (k for k, (other, busy) in enumerate(taken) if other == key and not (busy & a.path.active).any()),
+            len(taken),
+        )
+        if at == len(taken):
+            taken.append((key, np.zeros_like(a.path.active)))
+        taken[at] = key, taken[at][1] | a.path.active
+        slot.append(at)
+    return tuple(slot)
+
+
+def _arrays(asked, layer, slot, count, kept, new, chain, body) -> tuple[Any, Any]:
+    """Tasks and frames, padded: tasks to one of `SIZES`, mass points to a multiple of four."""
+    f, p, n = body.frames, len(chain.parents), max(slot, default=-1) + 1
     b = next((s for s in SIZES if s >= n), _padded(n, 8))
     kind, joint = np.zeros(b, np.int32), np.zeros(b, np.int32)
     reference, layers = np.full(b, p, np.int32), np.full(b, count - 1, np.int32)
     point, scale, look = np.zeros((b, 3)), np.zeros((b, 3)), np.tile([0.0, 0, 1], (b, 1))
     recruits, root, above, beside = np.zeros((b, p)), np.zeros(b), np.zeros((b, p)), np.zeros((b, p))
     active, place, rotation = np.zeros((f, b)), np.zeros((f, b, 3)), np.tile([1.0, 0, 0, 0], (f, b, 1))
-    for i, a in enumerate(asked):
-        kind[i], joint[i], layers[i], point[i], look[i] = a.kind, new[a.joint], layer[i], a.point, a.look
+    centers: dict[int, Asked] = {}
+    for a, own, i in zip(asked, layer, slot, strict=True):
+        kind[i], joint[i], layers[i], point[i], look[i] = a.kind, new[a.joint], own, a.point, a.look
         scale[i] = a.axes * np.sqrt(a.goal.weight)
         recruits[i, [new[j] for j in a.recruits]] = 1
         root[i] = float(any(body.top.parents[j] < 0 for j in a.recruits))
         above[i] = chain.above[new[a.joint]]
         if a.reference >= 0:
             reference[i], beside[i] = new[a.reference], chain.above[new[a.reference]]
-        active[:, i] = a.path.active
-        (rotation if a.kind == ORIENTATION else place)[:, i] = np.where(
-            a.path.active[:, None], a.path.goal, (rotation if a.kind == ORIENTATION else place)[:, i]
-        )
-    centers = [i for i, a in enumerate(asked) if a.kind == CENTER_OF_MASS]
-    mass_joint, mass_point, weights = _mass_points([asked[i] for i in centers], kept, new, body)
+        on = a.path.active
+        active[on, i] = 1
+        (rotation if a.kind == ORIENTATION else place)[on, i] = a.path.goal[on]
+        if a.kind == CENTER_OF_MASS:
+            centers[i] = a
+    mass_joint, mass_point, weights = _mass_points(list(centers.values()), kept, new, body)
     carried = weights[:, None, :] * chain.above[mass_joint].T[None]
     tasks = _laid(
         Tasks,
         kind, joint, reference, point, look, scale, layers, recruits, root, above, beside,
-        np.array(centers, np.int32), mass_joint, weights, carried,
+        np.array(list(centers), np.int32), mass_joint, weights, carried,
     )  # fmt: skip
     used = np.einsum("fb,bp->fp", active, recruits) > 0
     used_root = (active @ root) > 0

@@ -27,7 +27,7 @@ def residual_table(motion: Motion, plan: Plan) -> Float[np.ndarray, "f b"]:
     body = Body(motion, plan.origin)
     tasks, goals = plan.tasks, plan.frames.goals
     out = np.full((motion.frames, len(plan.order)), np.nan)
-    for b in range(len(plan.order)):
+    for k, b in enumerate(plan.slot):
         joint = int(plan.kept[tasks.joint[b]])
         world = tasks.reference[b] == len(plan.chain.parents)
         back = None if world else rotations(filled(body.turn(int(plan.kept[tasks.reference[b]])))).inv()
@@ -54,7 +54,7 @@ def residual_table(motion: Motion, plan: Plan) -> Float[np.ndarray, "f b"]:
             else:
                 value = np.linalg.norm(away * axes, axis=1)
         lost = body.lost(joint) | ~np.isfinite(goals.place[:, b]).all(1) | ~np.isfinite(goals.rotation[:, b]).all(1)
-        out[:, b] = np.where((goals.active[:, b] > 0) & ~lost, value, np.nan)
+        out[:, k] = np.where(plan.active[:, k] & ~lost, value, np.nan)
     return out
 
 
@@ -70,15 +70,15 @@ def _center(body: Body, plan: Plan, b: int) -> np.ndarray:
 
 def status_table(residual: np.ndarray, plan: Plan, solved: Any, settings: Settings) -> np.ndarray:
     """(F, B) indices into `STATUSES`, in the plan's order."""
-    n = len(plan.order)
-    active = plan.frames.goals.active[:, :n] > 0
-    held = np.array([settings.held / (RADIAN if k in (ORIENTATION, LOOK_AT) else 1.0) for k in plan.tasks.kind[:n]])
-    layer = plan.tasks.layer[:n]
+    slot = list(plan.slot)
+    active = plan.active
+    held = np.array([settings.held / (RADIAN if k in (ORIENTATION, LOOK_AT) else 1.0) for k in plan.tasks.kind[slot]])
+    layer = plan.tasks.layer[slot]
     why = np.where(solved.stayed[:, None] | (solved.iterations[:, None] < settings.iterations), STALLED, MAX_ITER)
     why = np.broadcast_to(why, active.shape)
     blocked = solved.own[:, layer] < BLOCKED
     why = np.where(blocked, CONFLICT, why)
-    why = np.where(solved.solo[:, :n] < BLOCKED, UNREACHABLE, why)
+    why = np.where(solved.solo[:, slot] < BLOCKED, UNREACHABLE, why)
     status = np.where(residual <= held, CONVERGED, why)
     status = np.where(np.isfinite(residual) & solved.sound[:, None], status, NONFINITE)
     return np.where(active, status, FREE).astype(int)

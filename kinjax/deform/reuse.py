@@ -18,7 +18,7 @@ def signatures(plan: Plan) -> list[bytes]:
     is in the plan and wherever its joints are in the chain."""
     tasks, goals = plan.tasks, plan.frames.goals
     names = np.append(plan.kept, -np.ones(len(plan.chain.parents) + 1 - len(plan.kept), int))
-    count = len(plan.order)
+    count = max(plan.slot, default=-1) + 1
     fixed = []
     for b in range(count):
         used = sorted(int(names[j]) for j in np.flatnonzero(tasks.recruits[b]))

@@ -1,8 +1,10 @@
-"""The frame loop: every frame starts where the one before it ended.
+"""The frame loop: every frame starts from where the one before it ended.
 
 In: a clip's goals and the input's poses, all frames along the first axis. Out: the poses and what is known of each frame.
-Source: 2004 paper, section 5.1, eq. 4: joints that a constraint controls start at their previous output, the others at the
-input, whose values they keep.
+Source: 2004 paper, section 5.1, eq. 4: joints that a constraint controls start from their previous output, the others at the
+input, whose values they keep. The start is the new input moved by the last displacement, not the last output itself: the
+two agree where the input rests, and where it does not, the first is where the output would be if nothing else changed
+(constraints that the input already keeps then give back the input; from the last output, swinging limbs outran the solver).
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .chain import Chain, Pose
+from .chain import Chain, Pose, compose, inverse_of
 from .frame_solver import Reference, Solving, solve_frame
 from .tasks import Goals, Kinds, Tasks
 
@@ -45,13 +47,16 @@ class Solved(NamedTuple):
     stayed: Bool[Array, " f"]
     sound: Bool[Array, " f"]
     trust: Float[Array, "f layers"]
+    pull: Float[Array, " f"]
 
 
 class Carried(NamedTuple):
-    """What a frame hands to the next: its pose (C = 1) and the trust of its layers (`State`)."""
+    """What a frame hands to the next: its pose and its input's (C = 1), the trust of its layers and the pull (`State`)."""
 
     pose: Pose
+    before: Pose
     trust: Float[Array, " layers"]
+    pull: Float[Array, ""]
 
 
 def solve_sequence(
@@ -71,11 +76,15 @@ def solve_sequence(
     """
 
     def step(carried: Carried, x: Frames) -> tuple[Carried, Solved]:
-        last, trust = carried
+        last, before, trust, pull = carried
         own = Pose(x.rotations[..., None], x.root[:, None])
+        # the last displacement, on the new input
+        turn = compose(last.rotations, compose(inverse_of(before.rotations), own.rotations))
         start = Pose(
-            jnp.where((x.controlled * x.warm)[None, :, None] > 0, last.rotations, own.rotations),
-            jnp.where(x.root_controlled * x.warm * x.goals.root_free > 0, last.root, own.root),
+            jnp.where((x.controlled * x.warm)[None, :, None] > 0, turn, own.rotations),
+            jnp.where(
+                x.root_controlled * x.warm * x.goals.root_free > 0, last.root + (own.root - before.root), own.root
+            ),
         )
         reference = Reference(
             x.rotations,
@@ -83,18 +92,18 @@ def solve_sequence(
             float(attract[0]) * x.controlled,
             float(attract[1]) * x.root_controlled * x.goals.root_free,
         )
-        s = solve_frame(chain, tasks, x.goals, start, x.offsets, reference, layers, solving, kinds, trust)
+        s = solve_frame(chain, tasks, x.goals, start, x.offsets, reference, layers, solving, kinds, trust, pull)
         sound = jnp.isfinite(s.pose.rotations).all() & jnp.isfinite(s.pose.root).all() & jnp.isfinite(s.errors).all()
         pose = Pose(
             jnp.where(sound & (x.controlled[None, :, None] > 0), s.pose.rotations, own.rotations),
             jnp.where(sound & (x.root_controlled * x.goals.root_free > 0), s.pose.root, own.root),
         )
         known = jnp.isfinite(pose.rotations).all() & jnp.isfinite(pose.root).all()
-        kept = Pose(jnp.where(known, pose.rotations, last.rotations), jnp.where(known, pose.root, last.root))
-        trust = jnp.where(sound, s.trust, trust)
+        kept, before = jax.tree.map(lambda new, old: jnp.where(known, new, old), (pose, own), (last, before))
+        trust, pull = jnp.where(sound, s.trust, trust), jnp.where(sound, s.pull, pull)
         out = Solved(
-            pose.rotations[..., 0], pose.root[:, 0], s.iterations, s.rank, s.solo, s.own, s.stayed, sound, trust
+            pose.rotations[..., 0], pose.root[:, 0], s.iterations, s.rank, s.solo, s.own, s.stayed, sound, trust, pull
         )  # fmt: skip
-        return Carried(kept, trust), out
+        return Carried(kept, before, trust, pull), out
 
     return jax.lax.scan(step, first, frames)

@@ -25,7 +25,8 @@ class Settings:
     together), spent in order of priority. damping: lambda of a layer whose error is `damped_error` metres or more; it falls
     with the error. drag, singular: the lowest layer is held back along directions in which it is nearly singular (singular
     values around `singular` metres a radian and below), by `drag` in the same unit: a limb that straightens does not snap;
-    0 for none. slack, slack_ratio: how much a layer may lose to a lower one in one iteration, metres and share.
+    0 for none. slack, slack_ratio: how much a layer may lose to a lower one in one iteration, or to the attraction, metres
+    and share.
 
     filter_root, filter_joints: cutoff in Hz of the low-pass filter of the displacement map's root translation and joint
     rotations, None for no filter. A map that is smooth to within `rough` metres (or radians) is left alone.

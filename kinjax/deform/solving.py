@@ -75,8 +75,8 @@ def solve(
             _, piece = _solve(chain, tasks, _piece(cast, begin, end), pose, numbers, **static)
             piece = jax.tree.map(lambda x, n=end - begin: np.asarray(x)[:n], piece)
         out.append(piece)
-        pose = _last(piece, pose)
-        linked = old is not None and _close(pose, _last(_taken(old, plan, begin, end), pose))
+        pose = _last(piece, cast, begin, pose)
+        linked = old is not None and _close(pose, _last(_taken(old, plan, begin, end), cast, begin, pose))
         tell(end - begin)
     return Run(plan, asked, frames, jax.tree.map(lambda *x: np.concatenate(x), *out))
 
@@ -105,9 +105,7 @@ def solve_many(plans: Sequence[Plan], settings: Settings, tell: Callable[[int], 
 
 
 def _solving(settings: Settings, dtype: np.dtype) -> Solving:
-    values: Any = [
-        np.asarray(getattr(settings, n), np.int32 if n == "iterations" else dtype) for n in Solving._fields
-    ]
+    values: Any = [np.asarray(getattr(settings, n), np.int32 if n == "iterations" else dtype) for n in Solving._fields]
     return Solving(*values)
 
 
@@ -122,9 +120,11 @@ def _stack(trees: Sequence[Any]) -> Any:
 def _begin(rotations: np.ndarray, root: np.ndarray, layers: int) -> Any:
     """What the first frame starts from; parts of it that are not finite begin at rest."""
     q = np.where(np.isfinite(rotations).all(0), rotations, np.eye(4, 1, dtype=rotations.dtype))
-    pose: Any = q[..., None], np.where(np.isfinite(root), root, 0)[:, None]
-    trust: Any = np.ones(layers, root.dtype)
-    return Carried(Pose(*pose), trust)
+    place: Any = np.where(np.isfinite(root), root, 0)[:, None]
+    turn: Any = q[..., None]
+    pose = Pose(turn, place)
+    ones: Any = np.ones(layers + 1, root.dtype)
+    return Carried(pose, pose, ones[1:], ones[0])
 
 
 def _piece(frames: Any, begin: int, end: int, empty: bool = False) -> Any:
@@ -140,13 +140,14 @@ def _piece(frames: Any, begin: int, end: int, empty: bool = False) -> Any:
     return piece
 
 
-def _last(piece: Any, before: Any) -> Any:
-    """What the frame after a piece starts from: the last finite pose, and the trust."""
+def _last(piece: Any, frames: Any, begin: int, before: Any) -> Any:
+    """What the frame after a piece, whose first frame is `begin`, starts from: the last finite pose and its input, trust and pull."""
     known = np.isfinite(piece.rotations).all((1, 2)) & np.isfinite(piece.root).all(1)
     if not known.any():
-        return before
+        return before._replace(trust=piece.trust[-1], pull=piece.pull[-1])
     at = len(known) - 1 - int(known[::-1].argmax())
-    return Carried(Pose(piece.rotations[at][..., None], piece.root[at][:, None]), piece.trust[-1])
+    pose, own = ((f.rotations[i][..., None], f.root[i][:, None]) for f, i in ((piece, at), (frames, begin + at)))
+    return Carried(Pose(*pose), Pose(*own), piece.trust[-1], piece.pull[-1])
 
 
 def _unchanged(frames: Any, asked: list[bytes], plan: Plan, old: Run | None) -> np.ndarray:
