@@ -81,7 +81,9 @@ def test_adding_lower_layers_moves_no_higher_one(precision):
         for i in range(LAYERS):
             rows = j[:, 3 * i : 3 * i + 3].astype(np.float64)
             leak = np.linalg.norm(np.einsum("cij,cj->ci", rows, step[:, -1] - step[:, i]), axis=1)
-            size = np.linalg.norm(rows, axis=(1, 2)) * (np.linalg.norm(step[:, -1], axis=1) + np.linalg.norm(step[:, i], axis=1))
+            size = np.linalg.norm(rows, axis=(1, 2)) * (
+                np.linalg.norm(step[:, -1], axis=1) + np.linalg.norm(step[:, i], axis=1)
+            )
             worst[kind] = max(worst.get(kind, 0), float((leak / np.maximum(eps * size, 1e-300)).max()))
     assert max(worst.values()) <= 20, worst
 
