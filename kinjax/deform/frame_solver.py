@@ -32,6 +32,10 @@ PULLS = (1.0, 0.25)
 """Shares of the attraction (of as much of it as is trusted) that are tried."""
 
 
+LEAST = 1 / 64
+"""The least that a layer is trusted with."""
+
+
 class Solving(NamedTuple):
     """Numbers of the solver (metres and radians): see `settings.Settings`."""
 
@@ -43,8 +47,8 @@ class Solving(NamedTuple):
     slack_ratio: float = 1e-4
     tolerance: float = 1e-5
     iterations: int = 10
-    drag: float = 0.3
-    singular: float = 0.2
+    drag: Array | float = 0.3
+    singular: float = 0.12
 
 
 class Tried(NamedTuple):
@@ -124,8 +128,11 @@ def solve_frame(
     kinds: Kinds,
     trust: Float[Array, " layers"],
     pull: Float[Array, ""],
+    drag: Float[Array, ""] | float = 1.0,
 ) -> State:
-    """Iterate from `start` until nothing is gained, `solving.iterations` times at most in each run."""
+    """Iterate from `start` until nothing is gained, `solving.iterations` times at most in each run. drag: 0 for a frame that has
+    none before it, from which to move smoothly."""
+    solving = solving._replace(drag=solving.drag * drag)
     step = _Iteration(chain, tasks, goals, offsets, reference, layers, solving, kinds)
     first = step.begin(start, trust, pull)
     # layers below the last active one are not there
@@ -271,6 +278,8 @@ class _Iteration:
         pull = jnp.clip(s.pull * jnp.clip(safe_sqrt(safe_divide(0.5 * jnp.ones_like(cost), cost)), 1 / 8, 2), 1e-4, 1)
         pull = jnp.where(cost > 0, pull, jnp.minimum(2 * s.pull, 1))
         waiting = (best >= pulls) & (s.pull > 1e-3) & (jnp.max(jnp.abs(z)) > solving.tolerance)
+        refused = jnp.arange(layers, dtype=jnp.int32) == layers + pulls - best
+        waiting |= jnp.any(refused & (s.trust > LEAST) & (s.errors > solving.slack) & ~below[:, 0])
         solo, own = _gains(factors.basis.factors, jac, r0, rows, members)
         return State(
             jax.tree.map(take, trial, s.pose),
@@ -293,7 +302,7 @@ class _Iteration:
         could not be judged."""
         level = jnp.arange(self.layers, dtype=jnp.int32)
         kept = jnp.where(best < len(PULLS), self.layers, self.layers + len(PULLS) - best)
-        less = jnp.maximum(trust / 2, 1 / 64)
+        less = jnp.maximum(trust / 2, LEAST)
         return jnp.where(level < kept, jnp.minimum(2 * trust, 1), jnp.where(level == kept, less, trust))
 
 

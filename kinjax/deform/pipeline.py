@@ -142,9 +142,9 @@ def _finish(
 
 
 def _worse(motion: Motion, plan: Plan, runs: list[Run], settings: Settings) -> bool:
-    """Whether the last pass lost more than `settings.held` of any constraint."""
+    """Whether the last pass lost more than a tenth of `settings.held` of any constraint."""
     before, after = (residual_table(output_motion(motion, plan, r.solved), plan) for r in runs[-2:])
-    return bool((np.nan_to_num(after) > np.nan_to_num(before) + settings.held).any())
+    return bool((np.nan_to_num(after) > np.nan_to_num(before) + 0.1 * settings.held).any())
 
 
 def output_motion(motion: Motion, plan: Plan, solved: Any) -> Motion:

@@ -539,4 +539,14 @@ def _frames(kept, p, body, used, used_root, goals) -> Any:
             root = path - body.origin
         elif j in kept:
             offsets[:, kept.index(j)] = path
-    return _laid(Frames, rotation, root, offsets, used.astype(float), used_root.astype(float), np.ones(f), goals)
+    return _laid(
+        Frames,
+        rotation,
+        root,
+        offsets,
+        used.astype(float),
+        used_root.astype(float),
+        np.ones(f),
+        (np.arange(f) > 0).astype(float),
+        goals,
+    )

@@ -93,9 +93,9 @@ def factorize(
     layer: of each row, not decreasing. damping: lambda of each row's layer, in units of the Jacobian; it is raised to
     `1e-6 |J_i|` in float64 and `1e-3 |J_i|` in float32, below which rounding would decide.
 
-    drag: (strength (m,) of each row's layer, sigma) holds a layer back where it is nearly singular: along a direction with
-    singular value `s` it is `G = strength^2 / (1 + (s / sigma)^2)^8`, and it pulls at the whole `travel` (n,), not only at
-    this step, so that what it allows does not depend on the number of steps.
+    drag: (strength (m,) of each row's layer, sigma as a share of the layer's root mean square row) holds a layer back where it
+    is nearly singular: along a direction with singular value `s` it is `G = strength^2 / (1 + (s / sigma)^2)^8`, and it pulls
+    at the whole `travel` (n,), not only at this step, so that what it allows does not depend on the number of steps.
     """
     basis = row_basis(jacobian)
     same = layer[:, None] == layer[None, :]
@@ -109,7 +109,9 @@ def factorize(
     if drag is None or travel is None:
         return Layered(basis, times(inverse(normal + jnp.diag(lambda2)), own.T), jnp.zeros_like(lambda2), carry)
     strength, sigma = drag
-    fade = inverse(jnp.eye(len(lambda2), dtype=own.dtype) + normal / sigma**2)
+    used = times(same.astype(own.dtype), (jnp.sum(jacobian * jacobian, axis=1) > 0).astype(own.dtype))
+    sigma2 = jnp.where(used > 0, sigma**2 * size2 / jnp.maximum(used, 1), jnp.ones_like(size2))
+    fade = inverse(jnp.eye(len(lambda2), dtype=own.dtype) + normal / safe_sqrt(sigma2[:, None] * sigma2[None, :]))
     fade = times(fade, fade)
     fade = times(fade, fade)
     hold = (strength[:, None] * strength[None, :]) * times(fade, fade)
@@ -149,7 +151,7 @@ def layered_step(
     """Coordinates `y` of the step in the row basis: `dm = y Q`. Those of a layer do not depend on the layers below it.
 
     residual: what each row should still move by, of one trial or of several (last axis). block: ones where two rows belong
-    to one constraint; a constraint asks for `clamp` at most (one number, or one a row). budget: the longest step in all,
+    to one constraint; no constraint of a layer asks for more than `clamp` (one number, or one a row). budget: the longest step in all,
     spent in order of priority (cutting the whole step would let a lower layer's long step shrink a higher one's). drag:
     whether the drag of `factorize` takes part.
     """
@@ -163,7 +165,9 @@ def layered_step(
 
     def sweep(_: Int[Array, ""], y: Float[Array, "m *c"]) -> Float[Array, "m *c"]:
         r = residual - times(factors.carry, y)
+        # one factor for a layer, that of its farthest constraint: weights keep their say
         length = safe_sqrt(times(block, r * r))
+        length = jnp.max(length[None] * beside.astype(r.dtype).reshape(*beside.shape, *[1] * (r.ndim - 1)), axis=1)
         r = r * jnp.minimum(1, safe_divide(jnp.broadcast_to(most, length.shape), length))
         y = times(factors.pull, r) + rest
         # what the layers above have spent, and what this one asks for

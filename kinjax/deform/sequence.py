@@ -23,7 +23,7 @@ from .tasks import Goals, Kinds, Tasks
 class Frames(NamedTuple):
     """F frames of input: local rotations (F, 4, P), root (F, 3), the joints' places in their parents' frames (F, P, 3), which
     joints are controlled (F, P) and whether the root's place is (F,), as 0 or 1, whether the frame starts where the one
-    before it ended (F,) or, with 0, at the input, and the goals."""
+    before it ended (F,) or, with 0, at the input, whether a straightening limb is held back (F,), and the goals."""
 
     rotations: Float[Array, "f 4 p"]
     root: Float[Array, "f 3"]
@@ -31,6 +31,7 @@ class Frames(NamedTuple):
     controlled: Float[Array, "f p"]
     root_controlled: Float[Array, " f"]
     warm: Float[Array, " f"]
+    dragged: Float[Array, " f"]
     goals: Goals
 
 
@@ -92,7 +93,9 @@ def solve_sequence(
             float(attract[0]) * x.controlled,
             float(attract[1]) * x.root_controlled * x.goals.root_free,
         )
-        s = solve_frame(chain, tasks, x.goals, start, x.offsets, reference, layers, solving, kinds, trust, pull)
+        s = solve_frame(
+            chain, tasks, x.goals, start, x.offsets, reference, layers, solving, kinds, trust, pull, x.dragged
+        )
         sound = jnp.isfinite(s.pose.rotations).all() & jnp.isfinite(s.pose.root).all() & jnp.isfinite(s.errors).all()
         pose = Pose(
             jnp.where(sound & (x.controlled[None, :, None] > 0), s.pose.rotations, own.rotations),

@@ -24,7 +24,7 @@ class Settings:
     clamp: metres that a constraint asks for in one iteration at most. budget: length of one step (radians and metres
     together), spent in order of priority. damping: lambda of a layer whose error is `damped_error` metres or more; it falls
     with the error. drag, singular: the lowest layer is held back along directions in which it is nearly singular (singular
-    values around `singular` metres a radian and below), by `drag` in the same unit: a limb that straightens does not snap;
+    values below the share `singular` of its rows' root mean square length): a limb that straightens does not snap; drag
     0 for none. slack, slack_ratio: how much a layer may lose to a lower one in one iteration, or to the attraction, metres
     and share.
 
@@ -46,7 +46,7 @@ class Settings:
     damping: float = 0.3
     damped_error: float = 0.05
     drag: float = 0.3
-    singular: float = 0.2
+    singular: float = 0.12
     slack: float = 1e-7
     slack_ratio: float = 1e-4
     filter_root: float | None = 4.0

@@ -165,6 +165,7 @@ def _shaped(span: Span, passes: tuple[Through, ...], own: np.ndarray, rate: floa
     points = _passes(passes, span, 3, rate, title)
     if span.first == span.last:
         return np.broadcast_to(np.asarray(points[0].point, float), own.shape).copy()
+    own = _known(own, np.asarray(points[0].point, float))
     speed = np.gradient(own, axis=0) * rate
     a, b = span.first, span.last
     try:
@@ -172,6 +173,15 @@ def _shaped(span: Span, passes: tuple[Through, ...], own: np.ndarray, rate: floa
     except OptionError as error:
         raise OptionError(f"{title}: {error}") from None
     return curve.position(np.clip(np.arange(len(own)), a, b) / rate)
+
+
+def _known(own: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """A trajectory with its lost frames bridged (they are flagged by the solver), or at rest at `other` if all are lost."""
+    lost = ~np.isfinite(own).all(1)
+    if lost.all():
+        return np.broadcast_to(other, own.shape)
+    t = np.arange(len(own))
+    return np.stack([np.interp(t, t[~lost], x[~lost]) for x in own.T], axis=1) if lost.any() else own
 
 
 def turn_path(goal: Orientation, title: str, span: Span, own: np.ndarray, rate: float) -> Path:
