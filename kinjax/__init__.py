@@ -1,6 +1,8 @@
 """kinjax: find the kinematic constraints in motion data, and bend motion to constraints.
 
 Names here are the public ones; each is imported on first use, so that `import kinjax` loads no reader, plot or engine.
+The rooms `kinjax.detect` and `kinjax.deform` have their doors inside, `kinjax.detect.detect` and `kinjax.deform.deform`;
+`kinjax.Settings` are those of detection, `kinjax.deform.Settings` those of deformation.
 """
 
 from importlib import import_module
@@ -23,11 +25,22 @@ _ROOMS = {
     "motion": ("Motion", "Poses", "make_poses"),
     "kinematics": ("object_poses", "cluster_poses", "forward_kinematics"),
     "detect": ("Detection", "Settings", "calibrate", "detect_many"),
-    "formats": ("load", "save", "read_bvh", "write_bvh", "read_annotations", "write_annotations"),
+    "deform": (
+        "CenterOfMass",
+        "Deformation",
+        "LookAt",
+        "Orientation",
+        "Position",
+        "Through",
+        "clean",
+        "deform_many",
+        "redeform",
+    ),
+    "formats": ("load", "save", "read_bvh", "write_bvh", "read_annotations", "write_annotations", "read_edit"),
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 
-_SUBMODULES = ("detect", "formats", "kinematics", "plots", "report", "synthetic")
+_SUBMODULES = ("deform", "detect", "formats", "kinematics", "plots", "report", "synthetic")
 
 __all__ = ["__version__", *sorted(_HOME), *_SUBMODULES]
 
@@ -37,7 +50,7 @@ def __getattr__(name: str) -> Any:
         value = getattr(import_module(f".{_HOME[name]}", __name__), name)
         globals()[name] = value
         return value
-    if name in _SUBMODULES:  # kinjax.detect is the room; its door is kinjax.detect.detect
+    if name in _SUBMODULES:  # a room, whose door is inside
         return import_module(f".{name}", __name__)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 

@@ -390,6 +390,9 @@ def test_what_is_no_text_file(tmp_path, data):
     for name, content, part in (
         ("empty", b"", "empty"),
         ("blank", b" \n\x00", "empty"),
+        ("only a byte-order mark", b"\xef\xbb\xbf", "empty"),
+        ("a byte-order mark and blanks", b"\xef\xbb\xbf \r\n\x00", "empty"),
+        ("only an end-of-file character", b"\n\x1a", "empty"),
         ("utf16", GOOD.encode("utf-16"), "UTF-16"),
         ("be", GOOD.encode("utf-16-be"), "UTF-16"),
         ("binary", bytes(range(256)) * 8, "UTF-16|binary"),

@@ -12,7 +12,7 @@ import pytest
 from kinjax.cli import main
 from kinjax.errors import OptionError
 
-COMMANDS = ("detect", "info", "plot", "report", "export", "samples", "demo")
+COMMANDS = ("detect", "deform", "clean", "info", "plot", "report", "export", "samples", "demo")
 
 
 @pytest.fixture(autouse=True)

@@ -17,10 +17,14 @@ ORDER = (
     "errors", "numerics", "rotations", "splines", "annotations", "skeleton", "anthropometry", "motion", "kinematics",
     "synthetic", "detect", "deform", "soft", "formats", "database", "plots", "report", "studio", "cli",
 )  # fmt: skip
-# Inside detect/ and cli/, the same; in detect/ a file that is not named here gathers the others.
+# Inside detect/, deform/ and cli/, the same; in detect/ a file that is not named here gathers the others.
 DETECT = (
     "settings", "results", "displacements", "sigma_epsilon", "lmeds", "noise", "instantaneous", "refit", "windows",
     "merging",
+)  # fmt: skip
+DEFORM = (
+    "constraints", "settings", "results", "prioritized", "chain", "tasks", "frame_solver", "sequence", "kochanek_bartels",
+    "shape", "recruiting", "targets", "balance", "filtering", "plan", "reuse", "solving", "reporting", "pipeline", "cleaning",
 )  # fmt: skip
 STRANGERS = ({"detect", "deform"}, {"studio", "cli"}, {"plots", "database"})
 CLI = ("cache", "options", "parse", "show", "request", "detecting", "deforming", "pictures", "commands", "demo")
@@ -94,11 +98,11 @@ def test_a_file_imports_only_from_above(path: Path):
 
 def inside(module: tuple[str, ...], other: tuple[str, ...], where: str) -> None:
     """The order within one folder, where there is one."""
-    order = {"detect": DETECT, "cli": CLI}.get(module[0], ())
+    order = {"detect": DETECT, "deform": DEFORM, "cli": CLI}.get(module[0], ())
     own, theirs = module[1:2], other[1:2]
     if own == theirs or not own:
         return  # a folder's own file gathers what is in it
-    assert theirs or module[0] != "detect", f"{where}: files of a folder do not import the folder"
+    assert theirs or module[0] not in ("detect", "deform"), f"{where}: files of a folder do not import the folder"
     if theirs and theirs[0] in order and own[0] in order:
         assert order.index(theirs[0]) < order.index(own[0]), f"{where}, which comes after {own[0]}"
     elif order and own[0] in order and theirs:
@@ -149,7 +153,11 @@ def test_importing_the_command_line_loads_nothing():
     assert loaded_by("import kinjax.cli, kinjax.errors") == set()
 
 
-@pytest.mark.parametrize("args", [["--help"], ["detect", "--help"], ["--version"], ["detect", "--no-such-option"]], ids=" ".join)
+@pytest.mark.parametrize(
+    "args",
+    [["--help"], *([c, "--help"] for c in ("detect", "deform", "clean")), ["--version"], ["detect", "--no-such-option"]],
+    ids=" ".join,
+)
 def test_help_loads_only_the_parser(args: list[str]):
     code = f"import contextlib\nfrom kinjax.cli import main\nwith contextlib.suppress(SystemExit):\n    main({args!r})"
     assert loaded_by(code) <= {"tyro"}

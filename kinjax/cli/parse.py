@@ -21,7 +21,7 @@ from .. import __version__
 from ..errors import OptionError
 from .options import NAMES, Command, Demo
 
-DESCRIPTION = """Find the kinematic constraints in motion data: planted feet, gripping hands, hinges.
+DESCRIPTION = """Find the kinematic constraints in motion data (planted feet, gripping hands, hinges), and bend motion to constraints.
 
 Without a command, `kinjax` runs the demo. `kinjax COMMAND --help` tells more."""
 

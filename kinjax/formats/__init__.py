@@ -1,6 +1,7 @@
-"""The file formats: motion comes in and goes out as BVH and npz; annotations as JSON, CSV, Parquet, npz and exports.
+"""The file formats: motion comes in and goes out as BVH and npz; annotations as JSON, CSV, Parquet, npz and exports;
+the constraints of a deformation as edit files.
 
-In: paths. Out: `Motion`, `Poses` and `Annotations`, in metres, seconds and radians: a file's own units, degrees and
+In: paths. Out: `Motion`, `Poses`, `Annotations` and `Edit`, in metres, seconds and radians: a file's own units, degrees and
 channel orders stop here. A file is read whole or refused (`FileFormatError`: file, line, column, what was found, the
 remedy); nothing is silently dropped, padded or repeated, and what was tolerated is said in `Motion.notes`. Files are
 written to a temporary neighbour and moved into place. Names are imported on first use.
@@ -20,8 +21,10 @@ if TYPE_CHECKING:
 _ROOMS = {
     "bvh": ("parse_bvh", "read_bvh"),
     "bvh_write": ("write_bvh",),
+    "bvh_like": ("write_bvh_like",),
     "npz": ("read_motion_npz", "read_poses_npz", "write_motion_npz", "write_poses_npz"),
     "annotations_io": ("read_annotations", "write_annotations"),
+    "edits": ("Edit", "parse_edit", "read_edit", "write_edit"),
     "exports": ("export",),
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
@@ -67,5 +70,7 @@ def save(path: str | Path, motion: Motion, **options: Any) -> Path:
     """
     writer = _WRITERS.get(Path(path).suffix.lower())
     if writer is None:
-        raise OptionError(f"{path}: no motion format has the suffix {Path(path).suffix!r}; write {' or '.join(_WRITERS)}")
+        raise OptionError(
+            f"{path}: no motion format has the suffix {Path(path).suffix!r}; write {' or '.join(_WRITERS)}"
+        )
     return __getattr__(writer)(path, motion, **options)

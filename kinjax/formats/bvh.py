@@ -79,11 +79,11 @@ def parse_bvh(raw: bytes, unit: str | float = "auto", up: Axis = "y", path: str 
 def _plain(raw: bytes, path: object) -> tuple[bytes, list[str]]:
     """The text of a file with `\\n` as line end, and notes; refuses what is no text."""
     notes = []
-    if not raw.strip(b" \t\r\n\v\f\x00"):
+    raw = raw.removeprefix(b"\xef\xbb\xbf")
+    if not raw.strip(b" \t\r\n\v\f\x00\x1a"):
         raise FileFormatError("the file is empty", path=path, remedy="get a complete copy")
     if raw[:2] in (b"\xff\xfe", b"\xfe\xff") or raw[:2].count(0) == 1:
         raise FileFormatError("the file is UTF-16 text", path=path, line=1, column=1, remedy="save it as UTF-8 or ASCII")
-    raw = raw.removeprefix(b"\xef\xbb\xbf")
     if raw[-1] in b"\x00\x1a":
         text = raw.rstrip(b"\x00\x1a")
         notes.append(f"NUL or end-of-file characters after the text were dropped ({len(raw) - len(text)})")
