@@ -18,10 +18,12 @@ def test_scene(name, data):
     for outcome in results.values():
         assert outcome.motion.frames == scene.motion.frames
         assert len(outcome.by_layer()) == 1 + max(outcome.deformation.report.layer)
-    findings = SCENES[name].check(scene, results)
-    if name == "reaching":
-        findings += reaching.check_edit(scene, results["balanced"])
-    claims(findings)
+        assert outcome.work()[0] == scene.motion.frames * outcome.deformation.report.passes
+    claims(SCENES[name].check(scene, results))
+
+
+def test_an_edit_of_the_reach(data):
+    claims(reaching.check_edit(data))
 
 
 def test_a_finding_says_what_was_asked():

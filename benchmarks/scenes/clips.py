@@ -1,4 +1,4 @@
-"""The clips of the scenes at the paper's rate, and what the scenes measure on motions: places, centre of mass, rests.
+"""The clips of the scenes (CMU 35_01 and 11_01) at the paper's rate, and what the scenes measure on motions: places, centre of mass, rests.
 
 In: the folder of real data, motions. Out: motions and NumPy arrays, float64, world metres. Everything here uses the motion's
 own kinematics, nothing of the deformation.
@@ -17,22 +17,30 @@ from kinjax.kinematics import forward_kinematics
 from kinjax.motion import Motion, resample
 
 RATE = 24.0
-"""Frames a second of the paper's motions (145 frames are 6 s)."""
+"""Frames a second of the paper's motions (145 frames are 6 s; no walk of the set is as long)."""
 
-WALK_LEG = ("Leg", "UpLeg", "HipJoint")
-FEET = ("LeftFoot", "LeftToeBase", "RightFoot", "RightToeBase")
+FEET = ("lfoot", "ltoes", "rfoot", "rtoes")
+"""Ankles and balls of the feet: the paper's four footplants."""
+LEGS = {
+    "lfoot": ("ltibia", "lfemur", "root"),
+    "ltoes": ("lfoot", "ltibia", "lfemur", "root"),
+    "rfoot": ("rtibia", "rfemur", "root"),
+    "rtoes": ("rfoot", "rtibia", "rfemur", "root"),
+}
+"""What a constraint on each of them recruits: `lhipjoint` and `rhipjoint` are bones of the pelvis, not joints of a person."""
+SPINE = ("thorax", "upperback", "lowerback", "root")
+BODY = (*dict.fromkeys(j for leg in LEGS.values() for j in leg), *SPINE[:-1])
+"""What the centre of mass recruits: legs and spine. Arms carry little and would have to be thrown about for it."""
 
 
 def load_walk(data: Path) -> Motion:
-    """12_01: six steps, the longest walk of the set (4.3 s; the paper's has 6 s). Its first frame, a T-pose, is left out."""
-    clip = kinjax.load(data / "bvh" / "cmu" / "cmu_12_01_walk.bvh")
-    return resample(clip.slice(1, clip.frames - 1), RATE)
+    """35_01: three seconds and six steps of a walk; stands on left and right foot in turn, five whole ones."""
+    return resample(kinjax.load(data / "bvh" / "cmu" / "35_01.bvh"), RATE)
 
 
 def load_kick(data: Path) -> Motion:
-    """A front kick of 131_01: the right foot steps up, kicks and comes back, the left one stands from frame 8 of 36 on."""
-    clip = kinjax.load(data / "bvh" / "cmu" / "131_01.bvh")
-    return resample(clip.slice(640, 815), RATE)
+    """11_01, a kick at a ball: the left foot comes to stand in frame 9, the right one swings past it, comes down in frame 24."""
+    return resample(kinjax.load(data / "bvh" / "cmu" / "11_01.bvh"), RATE).slice(70, 113)
 
 
 def poses(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
@@ -55,6 +63,11 @@ def center_of_mass(motion: Motion) -> np.ndarray:
     twice = 2 * np.cross(v, local)
     centers = position + local + w * twice + np.cross(v, twice)
     return np.einsum("j,fjc->fc", np.asarray(masses.fractions), centers)
+
+
+def sway(a: Motion, b: Motion) -> np.ndarray:
+    """Metres between the centres of mass of two motions over the ground, in each frame."""
+    return distance(*(center_of_mass(m)[:, [0, 2]] for m in (a, b)))
 
 
 def distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:

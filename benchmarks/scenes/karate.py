@@ -1,7 +1,8 @@
 """Karate (2004 paper, figures 5 and 6): a front kick that goes higher while the other foot stands and the body balances.
 
-The standing foot follows its original trajectory at high priority, the centre of mass at middle priority, the kicking ankle
-goes to a higher place at low priority, one that can be reached or one that cannot.
+The standing foot follows its original trajectory at high priority, the centre of mass (over the ground: a raised leg raises
+it) at middle priority, the kicking ankle goes to a higher place at low priority, one that can be reached or one that cannot.
+The sides are those of the clip, the paper's exchanged.
 """
 
 from __future__ import annotations
@@ -12,26 +13,27 @@ import numpy as np
 
 from kinjax.deform import CenterOfMass, Position, Through
 
-from .clips import center_of_mass, distance, load_kick, places
+from .clips import BODY, LEGS, distance, load_kick, places, sway
 from .scene import WEIGHTS, Finding, Outcome, Scene, Variant, kept
 
-BEGIN, TOP, END = 14, 20, 27
-"""The kick leaves the ground and comes back; its foremost frame."""
-STANDS = ("LeftAnkle", "LeftToe")
-GOALS = {"low": (0.30, 0.80, 1.25), "medium": (0.30, 1.10, 1.20), "high": (0.30, 1.35, 1.05)}
-BEYOND = (0.30, 1.75, 1.35)
+BEGIN, TOP, END = 10, 16, 22
+"""The right foot is furthest back, the left one about to lift its heel, the right foot about to come down."""
+STANDS = ("lfoot", "ltoes")
+GOALS = {"low": (0.20, 0.80, 1.08), "medium": (0.20, 1.05, 1.05), "high": (0.20, 1.30, 0.95)}
+BEYOND = (0.20, 1.75, 1.35)
 """World metres; the last one is out of reach of who stands on the other foot."""
 
 
 def build(data: Path) -> Scene:
-    """The scene on the kick of 131_01."""
+    """The scene on the kick of 11_01."""
     support = kept(STANDS, priority=3)
-    balance = CenterOfMass(priority=2, name="centre of mass as it was")
+    balance = CenterOfMass(axes="xz", priority=2, recruits=BODY, name="centre of mass as it was")
 
     def kick(at: tuple[float, float, float]) -> Position:
         return Position(
-            "RightAnkle", through=(Through(TOP, at),), begin=BEGIN, end=END, priority=1, name="kick to its goal"
-        )
+            "rfoot", through=(Through(TOP, at),), begin=BEGIN, end=END, priority=1, recruits=LEGS["rfoot"],
+            name="kick to its goal",
+        )  # fmt: skip
 
     beyond = (*support, balance, kick(BEYOND))
     variants = {
@@ -40,7 +42,7 @@ def build(data: Path) -> Scene:
         "weights": Variant(beyond, WEIGHTS),
     } | {name: Variant((*support, balance, kick(at))) for name, at in GOALS.items()}
     places = (BEYOND, *GOALS.values())
-    return Scene("karate", load_kick(data), variants, (17, TOP, 23), tuple(variants), places, ("RightAnkle",))
+    return Scene("karate", load_kick(data), variants, (13, TOP, 18), tuple(variants), places, ("rfoot",))
 
 
 def check(scene: Scene, results: dict[str, Outcome]) -> list[Finding]:
@@ -49,24 +51,21 @@ def check(scene: Scene, results: dict[str, Outcome]) -> list[Finding]:
     def moved(o: Outcome) -> float:
         return 1e3 * max(distance(places(o.motion, j), places(scene.motion, j)).max() for j in STANDS)
 
-    def off(o: Outcome) -> float:
-        return 1e3 * float(distance(center_of_mass(o.motion), center_of_mass(scene.motion)).max())
-
     out = []
     for name, o in results.items():
         if name == "weights":
             out.append(Finding("weights: the standing foot is disturbed", moved(o), above=5.0))
+        elif name.startswith("without"):
+            out.append(Finding(f"{name}: the standing foot stays", moved(o), below=0.5))
+            out.append(Finding(f"{name}: as closely as with it", moved(o), below=0.1, aim=True))
         else:
-            out.append(Finding(f"{name}: the standing foot stays", moved(o), below=0.1, aim=name.startswith("without")))
-        short = 1e3 * float(distance(places(o.motion, "RightAnkle")[TOP], np.array(GOALS.get(name, BEYOND))))
+            out.append(Finding(f"{name}: the standing foot stays", moved(o), below=0.1))
+        short = 1e3 * float(distance(places(o.motion, "rfoot")[TOP], np.array(GOALS.get(name, BEYOND))))
         if name in GOALS:
             out.append(Finding(f"{name}: the kick reaches its goal", short, below=1.0))
         elif name == "priorities":
             out.append(Finding("priorities: the goal stays out of reach", short, above=5.0))
-    if {"priorities", "without centre of mass"} <= set(results):
-        there, gone = off(results["priorities"]), off(results["without centre of mass"])
-        out.append(Finding("balanced: the centre of mass stays", there, below=10.0))
-        out.append(
-            Finding("balance: without it the centre of mass is further off", gone / max(there, 1.0), above=3, unit="x")
-        )
+    there, gone = (1e3 * sway(results[k].motion, scene.motion).max() for k in ("priorities", "without centre of mass"))
+    out.append(Finding("balanced: the centre of mass stays", there, below=1.0))
+    out.append(Finding("without its constraint it does not", gone, above=30.0))
     return out

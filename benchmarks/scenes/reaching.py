@@ -1,101 +1,93 @@
 """Reaching (2004 paper, figure 3): a walk in which the left hand takes something beside the path, with and without balance.
 
 The feet keep their trajectories at high priority (ankle and toe joint of each), the wrist reaches at middle priority during
-40 frames, with the spine's help, and the centre of mass stays on its original trajectory at low priority.
+40 frames, with the spine's help, and the centre of mass stays over its original trajectory on the ground at low priority (its
+height is free: who reaches down may bend).
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 
-from kinjax.deform import CenterOfMass, Position, deform, redeform
+from kinjax.deform import CenterOfMass, Position, deform, redeform, solving
 
-from .clips import FEET, RATE, center_of_mass, distance, load_walk, places
+from .clips import BODY, FEET, RATE, SPINE, distance, load_walk, places, poses, sway
 from .scene import Finding, Outcome, Scene, Variant, kept
 
-TRUNK = ("Spine1", "Spine", "LowerBack", "Hips")
-ARM = ("LeftForeArm", "LeftArm", "LeftShoulder")
-HOLD = (47, 52)
-"""Frames in which the wrist rests at its goal: a quarter of a second."""
-EASE = 17 / RATE
+ARM = ("lradius", "lhumerus", "lclavicle")
+HOLD = (33, 38)
+"""Frames in which the wrist rests at its goal: a quarter of a second, while the left foot stands."""
+EASED = 17
+EASE = EASED / RATE
 """With 17 frames to go there and 17 back, the constraint is active in 40 frames, as the paper's."""
-GOAL = (0.70, 0.95, 0.62)
-"""World metres: low and far to the left, out of an arm's reach of the walk, in reach with the spine's help."""
+GOAL = (0.85, 1.0, 1.0)
+"""World metres: hip high, to the left and ahead, out of an arm's reach of the walk, in reach with the spine's help."""
 
 EDIT = (0.0, 0.05, 0.0)
-SETTLE = 3
-"""Frames after the reach in which the last rounding of the way back may still be seen."""
+LATER = 16
+"""Frames by which the reach is put off for the edit: the clip's first frames have nothing to do with it then."""
+FILTER = 6
+"""Frames that the filter of the root reaches to either side (`Settings.filter_width` at the paper's rate)."""
 
 
-def build(data: Path) -> Scene:
-    """The scene on the walk of 12_01."""
+def build(data: Path, later: int = 0) -> Scene:
+    """The scene on the walk of 35_01; `later`: frames by which the reach is put off."""
+    motion = load_walk(data)
+    begin, end = HOLD[0] + later, HOLD[1] + later
+    goal = np.array(GOAL) + (places(motion, "root")[begin] - places(motion, "root")[HOLD[0]]) * (0, 0, 1)
     wrist = Position(
-        "LeftHand", at=GOAL, begin=HOLD[0], end=HOLD[1], ease_in=EASE, ease_out=EASE, priority=2,
-        recruits=ARM + TRUNK, name="wrist to its goal",
+        "lwrist", at=goal, begin=begin, end=end, ease_in=EASE, ease_out=EASE, priority=2,
+        recruits=ARM + SPINE, name="wrist to its goal",
     )  # fmt: skip
-    balance = CenterOfMass(priority=1, name="centre of mass as it was")
+    balance = CenterOfMass(axes="xz", priority=1, recruits=BODY, name="centre of mass as it was")
     feet = kept(FEET, priority=3)
     variants = {
         "balanced": Variant((*feet, wrist, balance)),
         "without centre of mass": Variant((*feet, wrist)),
     }
-    return Scene("reaching", load_walk(data), variants, (40, HOLD[0]), tuple(variants), (GOAL,), ("LeftHand",))
+    return Scene("reaching", motion, variants, (26, HOLD[0]), tuple(variants), (GOAL,), ("lwrist",))
 
 
 def check(scene: Scene, results: dict[str, Outcome]) -> list[Finding]:
-    """The paper's claims for figure 3, and that an edit of the reach alone gives the same as a new start."""
-    balanced = results["balanced"]
-    wrist = places(balanced.motion, "LeftHand")[HOLD[0] : HOLD[1] + 1]
-    feet = max(distance(places(balanced.motion, j), places(scene.motion, j)).max() for j in FEET)
-    before, after = active(scene)
-    change = balanced.deformation.report.change
-    outside = np.concatenate([change[: max(before - 1, 0)], change[after + SETTLE :]])
-    off = center_off(scene, balanced)
-    out = [
-        Finding("feet hold", 1e3 * feet, below=0.1),
-        Finding("the wrist is at its goal", 1e3 * float(distance(wrist, np.array(GOAL)).max()), below=1.0),
-        Finding("the centre of mass stays", 1e3 * off, below=30.0),
-        Finding("other frames are the input's", float(np.degrees(outside.max())), below=0.1, unit="deg", aim=True),
-    ]
-    if "without centre of mass" in results:
-        gone = center_off(scene, results["without centre of mass"])
-        out.append(
+    """The paper's claims for figure 3."""
+    out = []
+    first, last = (max(HOLD[0] - EASED - FILTER, 0), min(HOLD[1] + EASED + FILTER, scene.motion.frames - 1))
+    for name, o in results.items():
+        feet = max(distance(places(o.motion, j), places(scene.motion, j)).max() for j in FEET)
+        wrist = places(o.motion, "lwrist")[HOLD[0] : HOLD[1] + 1]
+        report = o.deformation.report
+        outside = np.r_[0:first, last + 1 : scene.motion.frames]
+        out += [
+            Finding(f"{name}: feet hold", 1e3 * feet, below=0.1),
+            Finding(f"{name}: the wrist is at its goal", 1e3 * float(distance(wrist, np.array(GOAL)).max()), below=1.0),
             Finding(
-                "without its constraint it is further off, in its distance or mm",
-                gone / max(off, 1e-3),
-                above=3.0,
-                unit="x",
-            )
-        )
+                f"{name}: other frames are the input's", np.degrees(report.change[outside].max()), 1e-6, unit="deg"
+            ),
+            Finding(f"{name}: and where it was", 1e3 * report.root_change[outside].max(), below=1e-6),
+        ]
+    there, gone = (1e3 * sway(results[k].motion, scene.motion).max() for k in ("balanced", "without centre of mass"))
+    out.append(Finding("balanced: the centre of mass stays", there, below=1.0))
+    out.append(Finding("without its constraint it does not", gone, above=30.0))
     return out
 
 
-def active(scene: Scene) -> tuple[int, int]:
-    """First and last frame in which the wrist is asked for anything."""
-    frames = int(np.ceil(EASE * RATE - 1e-9))
-    return max(HOLD[0] - frames, 0), min(HOLD[1] + frames, scene.motion.frames - 1)
-
-
-def center_off(scene: Scene, outcome: Outcome) -> float:
-    """The largest distance of the centre of mass from its original trajectory, metres."""
-    return float(distance(center_of_mass(outcome.motion), center_of_mass(scene.motion)).max())
-
-
-def edited(scene: Scene) -> Scene:
-    """The same with the goal 5 cm higher."""
-    own = scene.variants["balanced"]
-    goals = tuple(replace(g, at=np.array(GOAL) + EDIT) if g.name == "wrist to its goal" else g for g in own.constraints)
-    return replace(scene, variants={"balanced": Variant(goals, own.settings)})
-
-
-def check_edit(scene: Scene, balanced: Outcome) -> list[Finding]:
-    """`redeform` after an edit of the goal against `deform` of the edited constraints: the same."""
-    new = edited(scene)
-    constraints = new.variants["balanced"].constraints
-    again = redeform(balanced.deformation, scene.motion, constraints)
-    whole = deform(scene.motion, constraints, new.variants["balanced"].settings)
-    apart = np.abs(np.asarray(again.motion.rotations) - np.asarray(whole.motion.rotations)).max()
-    return [Finding("an edit followed is the same as solved anew", float(apart), below=1e-6, unit="")]
+def check_edit(data: Path) -> list[Finding]:
+    """`redeform` after the goal alone has moved: fewer frames are solved than by `deform`, and they come out the same."""
+    scene = build(data, LATER)
+    before = scene.variants["balanced"].constraints
+    edited = tuple(replace(g, at=np.asarray(g.at) + EDIT) if g.name == "wrist to its goal" else g for g in before)
+    start = deform(scene.motion, before)
+    with patch.object(solving, "_solve", wraps=solving._solve) as call:
+        again = redeform(start, scene.motion, edited)
+        few = call.call_count
+        whole = deform(scene.motion, edited)
+        all_of_them = call.call_count - few
+    apart = np.abs(poses(again.motion)[1] - poses(whole.motion)[1]).max()
+    return [
+        Finding("an edit solves a part of the clip", few / all_of_them, below=0.99, unit="of its pieces"),
+        Finding("and gives what solving all of it gives", 1e3 * float(apart), below=1e-3),
+    ]
