@@ -196,3 +196,21 @@ class Annotations:
     warnings: tuple[str, ...] = ()
     unit: str = "m"
     method: str = ""
+
+    def at_rate(self, fps: float, frames: int) -> Annotations:
+        """The same constraints in the frames of a clip of `fps` frames a second that has `frames` of them.
+
+        A constraint covers the frames whose times lie in it, both ends included, or the nearest one where there are none.
+        Patterns keep their control points, and templates their frames.
+        """
+        if not (np.isfinite(fps) and fps > 0 and self.fps > 0 and frames > 0):
+            raise OptionError(f"{self.fps} frames a second cannot become {frames} frames at {fps}: both must be positive")
+        ratio, last = fps / self.fps, frames - 1
+
+        def moved(c: Constraint) -> Constraint:
+            begin, end = int(np.ceil(c.begin * ratio - 1e-6)), int(np.floor(c.end * ratio + 1e-6))
+            if begin > end:
+                begin = end = round((c.begin + c.end) / 2 * ratio)
+            return replace(c, begin=min(begin, last), end=min(end, last), fps=float(fps))
+
+        return replace(self, fps=float(fps), frames=frames, constraints=Constraints(tuple(map(moved, self.constraints))))

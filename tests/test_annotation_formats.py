@@ -293,6 +293,18 @@ def test_exports_that_make_no_sense(tmp_path):
         export(Annotations("c", 1.0, 5, Constraints((Constraint("x", "space", 0, 5, (0, 0, 0)),))), tmp_path / "a.vtt")
 
 
+def test_another_rate_keeps_the_times_that_are_inside():
+    at = [Constraint("a", "space", b, e, (0.0, 0.0, 0.0), fps=25.0) for b, e in ((0, 0), (3, 10), (24, 24), (2, 3))]
+    found = Annotations("clip", 25.0, 25, Constraints(tuple(at)))
+    fast = found.at_rate(60.0, 60)  # ratio 2.4: 7.2..24 and 4.8..7.2 hold the frames 8..24 and 5..7
+    assert [(c.begin, c.end, c.fps) for c in fast.constraints] == [(0, 0, 60), (8, 24, 60), (58, 58, 60), (5, 7, 60)]
+    assert (fast.fps, fast.frames, fast.at_rate(60.0, 60)) == (60, 60, fast)
+    slow = found.at_rate(5.0, 5)
+    assert [(c.begin, c.end) for c in slow.constraints] == [(0, 0), (1, 2), (4, 4), (0, 0)]  # the last was between two
+    with pytest.raises(OptionError, match="positive"):
+        found.at_rate(0.0, 60)
+
+
 def test_importing_the_formats_loads_nothing_heavy():
     code = "import sys, kinjax.formats; print([m for m in ('pyarrow', 'msgspec', 'kinjax.formats.bvh', 'jax') if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

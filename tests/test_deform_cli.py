@@ -48,6 +48,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_poses_npz(top / "door.npz", hinge().poses)
     (top / "raise.toml").write_text(EDIT)
     (top / "nothing.toml").write_text("# no constraints\n")
+    (top / "blanks.toml").write_text(" \n\t\n")
     (top / "bad.toml").write_text("[[position]]\njoint = 'RightHnad'\n")
     (top / "wrong.toml").write_text("[[position]]\njonit = 'RightHand'\n")
     (top / "far.toml").write_text("[[position]]\njoint = 'RightHand'\nend = 100000\n")
@@ -129,8 +130,10 @@ def test_the_report_tells_every_frame(bent: Path):
     assert found["change"]["root"] == 0
 
 
-def test_no_constraints_give_the_same_numbers(folder: Path, capsys: pytest.CaptureFixture[str]):
-    assert main(["deform", str(folder / "walk.bvh"), str(folder / "nothing.toml"), "-o", str(folder / "same.bvh")]) == 0
+@pytest.mark.parametrize("name", ["nothing", "blanks"])
+def test_no_constraints_give_the_same_numbers(name: str, folder: Path, capsys: pytest.CaptureFixture[str]):
+    nothing = str(folder / f"{name}.toml")
+    assert main(["deform", str(folder / "walk.bvh"), nothing, "-o", str(folder / "same.bvh")]) == 0
     assert (folder / "same.bvh").read_bytes() == (folder / "walk.bvh").read_bytes()
     out = capsys.readouterr().out
     assert "constraint " in out and "same.bvh" in out
@@ -185,6 +188,33 @@ def test_clean_finds_planted_feet(folder: Path, tmp_path: Path, capsys: pytest.C
     assert "looking at LeftFoot, RightFoot (feet, by name)" in out
     rows = json.loads((tmp_path / "r.json").read_text())["constraints"]
     assert len(rows) >= 6 and max(r["largest"] for r in rows) < 1e-3
+
+
+@pytest.mark.parametrize("earlier", [False, True], ids=["found now", "found earlier"])
+def test_clean_finds_at_another_rate_and_holds_at_the_clips(earlier: bool, folder: Path, tmp_path: Path):
+    """What is found in a clip that was resampled is held in the frames of the clip."""
+    walk, rate = str(folder / "walk.bvh"), ["--rate", "25"]
+    if earlier:
+        assert main(["detect", walk, *rate, "--object", "LeftFoot", "-o", str(tmp_path / "slow.csv"), "-q"]) == 0
+        rate = ["--annotations", str(tmp_path / "slow.csv")]
+    args = [*rate, "--object", "LeftFoot", "-o", str(tmp_path / "c.bvh"), "--report", str(tmp_path / "r.json"), "-q"]
+    assert main(["clean", walk, *args]) == 0
+    rows = json.loads((tmp_path / "r.json").read_text())["constraints"]
+    truth = [c for c in json.loads((folder / "truth.json").read_text())["constraints"] if c["object"] == "LeftFoot"]
+    spans = [(c["begin"] - 6, c["end"] + 6) for c in truth]  # the easing is 6 frames
+    assert rows and max(r["largest"] for r in rows) < 1e-3
+    for r in rows:
+        first, last = r["frames_active"][0], r["frames_active"][-1]
+        assert any(b - 3 <= first and last <= e + 3 for b, e in spans), (first, last, spans)
+
+
+def test_annotations_of_another_duration_are_refused(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    found = json.loads((folder / "truth.json").read_text())
+    (tmp_path / "other.json").write_text(json.dumps({**found, "fps": 30.0, "frames": found["frames"] - 20}))
+    args = ["--annotations", tmp_path / "other.json", "-o", tmp_path / "c.bvh"]
+    assert "frames" in fails(capsys, "clean", folder / "walk.bvh", *args)
 
 
 def test_clean_without_anything_to_hold_says_so(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

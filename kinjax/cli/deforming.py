@@ -146,7 +146,7 @@ def _found(motion: Motion, clip: Path, options: Clean) -> tuple[Annotations, str
             motion, objects=list(asked.objects), templates=list(asked.templates), relative_to=asked.relative_to,
             settings=asked.settings,
         )  # fmt: skip
-        return found.annotations(), note or asked.note
+        return _fitting(found.annotations(), motion), note or asked.note
     if options.template:
         raise OptionError("--template is for detection, and --annotations says what was found")
     from ..formats import read_annotations
@@ -160,7 +160,16 @@ def _found(motion: Motion, clip: Path, options: Clean) -> tuple[Annotations, str
         if (not wanted or c.object.casefold() in {w.casefold() for w in wanted})
         and (not options.type or c.type in options.type)
     ]
-    return replace(found_before, constraints=Constraints(tuple(chosen))), ""
+    return _fitting(replace(found_before, constraints=Constraints(tuple(chosen))), motion), ""
+
+
+def _fitting(found: Annotations, motion: Motion) -> Annotations:
+    """What was found at another rate (`--rate`) in the frames of the clip; of another duration, it is left, and refused later."""
+    rate = float(motion.rate)
+    if found.frames in (0, motion.frames) or not found.fps > 0:
+        return found
+    seconds = abs((found.frames - 1) / found.fps - (motion.frames - 1) / rate)
+    return found.at_rate(rate, motion.frames) if seconds <= max(1 / found.fps, 1 / rate) else found
 
 
 def _feet(motion: Motion) -> tuple[tuple[str, ...], str]:
