@@ -4,6 +4,7 @@ import contextlib
 import io
 import pickle
 import zipfile
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -52,6 +53,33 @@ def test_motion_comes_back_bit_for_bit(tmp_path, batch, dtype):
     assert write_motion_npz(path, read_motion_npz(path)).read_bytes() == first  # and no clock in it
     with np.load(path, allow_pickle=False) as plain:  # any NumPy can read it
         np.testing.assert_array_equal(plain["rotations"], m.rotations)
+
+
+def test_masses_and_limits_come_back_where_they_are_known(tmp_path):
+    m, rng = some_motion(), np.random.default_rng(2)
+    measures = {"masses": np.array([3.0, 2.0]), "mass_centers": rng.normal(size=(2, 3)), "limits": rng.normal(size=(2, 3, 2))}
+    for names in ((), ("limits",), ("masses", "mass_centers"), tuple(measures)):
+        known = replace(m, skeleton=replace(m.skeleton, **{n: measures[n] for n in names}))
+        back = read_motion_npz(write_motion_npz(tmp_path / "m.npz", known))
+        same(back, known)
+        assert [n for n in measures if getattr(back.skeleton, n) is not None] == [n for n in measures if n in names]
+
+
+def test_measures_that_do_not_fit(tmp_path):
+    m, path = some_motion(), tmp_path / "m.npz"
+    for name, shape in (("masses", (3,)), ("mass_centers", (2,)), ("limits", (2, 2, 3))):
+        wrong = replace(m, skeleton=replace(m.skeleton, **{name: np.zeros(shape)}))
+        with pytest.raises(ShapeError, match=name):
+            write_motion_npz(path, wrong)
+        assert not path.exists()
+        content = members(write_motion_npz(path, m))
+        rewrite(path, {**content, f"{name}.npy": npy(np.zeros(shape))})
+        refused(path, name, str(shape))
+        rewrite(path, {**content, "weights.npy": npy(np.zeros(2))})
+        refused(path, "weights")
+        path.unlink()
+    with pytest.raises(ShapeError, match="masses is of type int"):
+        write_motion_npz(path, replace(m, skeleton=replace(m.skeleton, masses=np.array([3, 2]))))
 
 
 def test_arrays_of_the_engine(tmp_path, x64):

@@ -2,8 +2,9 @@
 
 In: a `Motion` or `Poses` of any batch shape and precision. Out: a file, and back the same record with NumPy arrays. What
 is static (names, parents, channels, up axis, rate) is the JSON document of `npz_container`; the arrays are
-`translations, rotations, offsets, end_offsets` of a motion, `rotation, position, valid` of poses; shapes and units as in
-`kinjax.motion` and `kinjax.skeleton`. Versions: "kinjax-motion/1", "kinjax-poses/1".
+`translations, rotations, offsets, end_offsets` of a motion, and `masses, mass_centers, limits` where its skeleton has them;
+`rotation, position, valid` of poses; shapes and units as in `kinjax.motion` and `kinjax.skeleton`. Versions:
+"kinjax-motion/1", "kinjax-poses/1".
 """
 
 from __future__ import annotations
@@ -22,6 +23,9 @@ from .files import clean_text
 from .npz_container import read_npz, write_npz
 
 MOTION, POSES = "kinjax-motion/1", "kinjax-poses/1"
+MEASURES = ("masses", "mass_centers", "limits")
+"""What a skeleton may know beside its lengths; a file holds those that are known."""
+
 Record = TypeVar("Record", bound=msgspec.Struct)
 
 
@@ -56,6 +60,8 @@ def write_motion_npz(path: str | Path, motion: Motion) -> Path:
         "offsets": np.asarray(motion.skeleton.offsets),
         "end_offsets": np.asarray(motion.skeleton.end_offsets),
     }
+    known = {n: getattr(motion.skeleton, n) for n in MEASURES}
+    arrays |= {n: np.asarray(x) for n, x in known.items() if x is not None}
     if wrong := _motion_shapes(t, arrays):
         raise ShapeError(f"{motion.name or 'motion'}: {wrong}")
     names = ("names", "parents", "channels", "translated", "end_parents", "end_names", "up")
@@ -74,7 +80,8 @@ def read_motion_npz(path: str | Path) -> Motion:
         raise FileFormatError(str(e), path=path, remedy="get a complete copy") from e
     if wrong := _motion_shapes(topology, arrays):
         raise FileFormatError(wrong, path=path, remedy="get a complete copy")
-    skeleton = Skeleton(arrays["offsets"], arrays["end_offsets"], topology)
+    known = {n: arrays[n] for n in MEASURES if n in arrays}
+    skeleton = Skeleton(arrays["offsets"], arrays["end_offsets"], topology, **known)
     return Motion(arrays["translations"], arrays["rotations"], skeleton, meta.rate, meta.name, meta.notes)
 
 
@@ -121,12 +128,16 @@ def _missing(arrays: dict[str, np.ndarray], wanted: dict[str, str]) -> str:
 
 def _motion_shapes(t: Topology, arrays: dict[str, np.ndarray]) -> str:
     """What does not fit, or ""."""
-    if wrong := _missing(arrays, dict.fromkeys(("translations", "rotations", "offsets", "end_offsets"), "f")):
+    known = [n for n in MEASURES if n in arrays]
+    if wrong := _missing(arrays, dict.fromkeys(("translations", "rotations", "offsets", "end_offsets", *known), "f")):
         return wrong
     joints, moving, ends = len(t.names), len(t.translated), len(t.end_parents)
     if len(t.end_names) not in (0, ends) or any(not 0 <= i < joints for i in (*t.translated, *t.end_parents)):
         return f"the moving joints or End Sites do not fit the {joints} joints"
     shapes = {n: a.shape for n, a in arrays.items()}
+    measured = {"masses": (joints,), "mass_centers": (joints, 3), "limits": (joints, 3, 2)}
+    if wrong := next((n for n in known if shapes[n] != measured[n]), ""):
+        return f"{wrong} has the shape {shapes[wrong]}, not {measured[wrong]} for {joints} joints"
     fits = shapes["offsets"] == (joints, 3) and shapes["end_offsets"] == (ends, 3)
     fits &= shapes["rotations"][-2:] == (joints, 4) and shapes["translations"][-2:] == (moving, 3)
     if not fits or shapes["rotations"][:-2] != shapes["translations"][:-2] or len(shapes["rotations"]) < 3:
