@@ -20,7 +20,7 @@
 import numpy as np
 
 from kinjax import plots, synthetic
-from kinjax.deform import CenterOfMass, Position, Settings, deform, redeform
+from kinjax.deform import CenterOfMass, Position, deform, redeform
 from kinjax.kinematics import forward_kinematics
 from kinjax.motion import resample
 
@@ -47,8 +47,7 @@ print("from", hand.round(2), "to", goal.round(2))
 # %%
 span = {"begin": middle - 3, "end": middle + 2, "ease_in": 0.5, "ease_out": 0.5}
 reach = Position("LeftHand", at=goal, priority=2, name="hand to its goal", **span)
-settings = Settings(iterations=20, slack=1e-5)
-alone = deform(walk, [reach], settings)
+alone = deform(walk, [reach])
 print(alone.report)
 
 # %%
@@ -64,7 +63,7 @@ print(f"the feet slide by up to {100 * np.linalg.norm(after - before, axis=-1).m
 
 # %%
 planted = [Position(f, priority=3, name=f"{f} as it was") for f in feet]
-stepping = deform(walk, [*planted, reach], settings)
+stepping = deform(walk, [*planted, reach])
 print(stepping.report)
 
 # %% [markdown]
@@ -75,7 +74,7 @@ print(stepping.report)
 
 # %%
 balance = CenterOfMass(priority=1, name="centre of mass as it was")
-balanced = deform(walk, [*planted, reach, balance], settings)
+balanced = deform(walk, [*planted, reach, balance])
 print(balanced.report)
 
 # %%

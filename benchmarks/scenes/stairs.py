@@ -7,12 +7,14 @@ legs. It and the body's height follow from legs that are drawn to the walk's.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from kinjax.deform import CenterOfMass, Orientation, Position, Settings, Through
+from kinjax.deform.targets import place_path, span_of
 from kinjax.motion import Motion
 
 from .clips import FEET, LEGS, RATE, distance, load_walk, places, poses, rests
@@ -29,9 +31,7 @@ TRAY = (12, 64)
 def build(data: Path) -> Scene:
     """The scene on the walk of 35_01."""
     motion = load_walk(data)
-    feet = tuple(
-        Position(j, through=passes(motion, j), priority=4, recruits=LEGS[j], name=f"{j} on the stairs") for j in FEET
-    )
+    feet = shapes(motion)
     elbow = Position(
         "rradius", relative_to="thorax", at=elbow_place(motion), begin=TRAY[0], end=TRAY[1], priority=3,
         recruits=("rhumerus", "rclavicle"), name="elbow beside the torso",
@@ -47,6 +47,25 @@ def build(data: Path) -> Scene:
     variants = {"climbing": Variant((*feet, elbow, forearm, balance), Settings(attract_root=False))}
     lines = {"stairs": profile(motion)}
     return Scene("stairs", motion, variants, (8, 20, 32, 44, 56, 66), tuple(variants), (), ("lfoot", "rfoot"), lines)
+
+
+def shapes(motion: Motion) -> tuple[Position, ...]:
+    """The feet's four shape-constraints; the toes' as paths, drawn to a bone's length from the ankle's.
+
+    Between their passes two splines on one bone contradict each other by millimetres.
+    """
+    curve = {}
+    for j in FEET:
+        goal = Position(j, through=passes(motion, j), priority=4, recruits=LEGS[j], name=f"{j} on the stairs")
+        span = span_of(goal, goal.name, motion.frames, RATE)
+        curve[j] = goal, place_path(goal, goal.name, span, places(motion, j), RATE).goal
+    out = []
+    for ankle, toes in (FEET[:2], FEET[2:]):
+        (above, at), (below, to) = curve[ankle], curve[toes]
+        bone = np.linalg.norm(motion.skeleton.offsets[motion.skeleton.topology.index(toes)])
+        way = (to - at) / np.linalg.norm(to - at, axis=1, keepdims=True) * bone
+        out += [above, replace(below, through=(), path=at + way)]
+    return tuple(out)
 
 
 def stands(motion: Motion) -> list[tuple[str, int, int, float]]:
