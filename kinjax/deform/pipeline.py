@@ -65,11 +65,14 @@ def deform_many(
     constraints: Sequence[Sequence[Goal]],
     settings: Settings | None = None,
     progress: Progress | None = None,
+    together: bool | None = None,
 ) -> list[Deformation]:
-    """`deform` of several clips side by side, each with its own constraints; lengths may differ.
+    """`deform` of several clips, each with its own constraints; lengths may differ.
 
-    Clips whose constraints lead to arrays of one shape (as many joints, constraints and layers) run through one compiled
-    program together. The results are those of `deform` up to rounding. Filtering passes run clip by clip.
+    Clips whose constraints lead to arrays of one shape (as many joints, constraints and layers) share one compiled program.
+    together: whether it takes them all at once (`vmap`), frame by frame, or one after another; default: all at once, but not
+    on a CPU, where the frame loop of one clip is faster (`benchmarks.deform_speed`). The results are those of `deform`, up to
+    rounding. Filtering passes run clip by clip.
     """
     settings = settings or Settings()
     if len(motions) != len(constraints):
@@ -88,9 +91,14 @@ def deform_many(
         groups: dict[object, list[int]] = {}
         for i, plan in enumerate(plans):
             groups.setdefault(_shape(plan), []).append(i)
+        at_once = jax.default_backend() != "cpu" if together is None else together
         for members in groups.values():
-            for i, solved in zip(members, solve_many([plans[i] for i in members], settings, tell), strict=True):
-                run = Run(plans[i], [], plans[i].frames, solved)
+            if at_once:
+                solved = solve_many([plans[i] for i in members], settings, tell)
+                runs = [Run(plans[i], [], plans[i].frames, s) for i, s in zip(members, solved, strict=True)]
+            else:
+                runs = [solve(plans[i], plans[i].frames, [], settings, tell, None) for i in members]
+            for i, run in zip(members, runs, strict=True):
                 out[i] = _finish(motions[i], plans[i], settings, lambda n: None, run, ())
     return [d for d in out if d is not None]
 
