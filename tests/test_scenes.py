@@ -11,10 +11,15 @@ def claims(findings):
     assert findings and all(f.holds or f.aim for f in findings), "\n" + "\n".join(map(str, findings))
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_scene(name, data):
+LONG = {"karate": ("weights",)}
+"""Variants left to the long tests: stepping shows priorities against weights already."""
+
+
+@pytest.mark.parametrize("name", [*SCENES, *(pytest.param(n, marks=pytest.mark.slow, id=f"{n} whole") for n in LONG)])
+def test_scene(name, data, request):
     scene = SCENES[name].build(data)
-    results = run(scene)
+    whole = request.node.get_closest_marker("slow") is not None
+    results = run(scene, [v for v in scene.variants if whole or v not in LONG.get(name, ())])
     for outcome in results.values():
         assert outcome.motion.frames == scene.motion.frames
         assert len(outcome.by_layer()) == 1 + max(outcome.deformation.report.layer)
