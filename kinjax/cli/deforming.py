@@ -24,7 +24,6 @@ import numpy as np
 
 from ..annotations import Annotations, Constraints
 from ..deform import STATUSES, Deformation, Settings, constraints_from, deform
-from ..deform.cleaning import SETTINGS as CLEANING
 from ..detect import detect
 from ..errors import OptionError, UnknownNameError, find_name
 from ..motion import Motion
@@ -60,7 +59,7 @@ def clean_command(options: Clean) -> int:
     """`kinjax clean`."""
     clip = _checked(options.clip, options)
     motion = _motion(clip, options)
-    settings = _settings(options, CLEANING)
+    settings = _settings(options, Settings())
     screen = Screen(options.quiet)
     use_cache()
     with screen.busy() as busy:

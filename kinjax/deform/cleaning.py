@@ -41,10 +41,6 @@ from .targets import quaternions, rotations
 EASE = 0.1
 """Seconds in which a joint is brought to its held place before a constraint, and let go after it."""
 
-SETTINGS = Settings(slack=1e-4)
-"""What `clean` uses unless told otherwise. While a foot is held the rest of the body follows the input, in its null space; that
-curves, so a constraint that already holds must be allowed to lose a little in a step; it gets it back in the next."""
-
 SHORTEST = 5
 """Frames of a line or point that must remain for it to be held."""
 
@@ -63,7 +59,7 @@ def clean(
 ) -> Deformation:
     """`motion` with every constraint in `annotations` kept exactly: see `constraints_from`, whose options these are."""
     goals = constraints_from(annotations, motion, relative_to=relative_to, ease=ease)
-    return deform(motion, goals, settings or SETTINGS, progress)
+    return deform(motion, goals, settings, progress)
 
 
 def constraints_from(
