@@ -17,6 +17,7 @@ from kinjax.deform import (
     Through,
     deform,
     deform_many,
+    least_squares,
     redeform,
     solving,
 )
@@ -413,3 +414,18 @@ def test_progress_counts_to_the_end(motion):
     seen = []
     deform(motion, [*FEET, reach()], progress=lambda done, total: seen.append((done, total)))
     assert seen[-1][0] == seen[-1][1] and all(a <= b for a, b in seen)
+
+
+def test_weighted_least_squares_agrees_where_all_can_be_had(motion, reached):
+    """Optimistix on the same problem: the same places where nothing conflicts; where the hand is out of reach, it pulls at the
+    feet, and the less the larger the weight between the layers."""
+    d = least_squares(motion, [*FEET, reach()], Settings(iterations=30))
+    assert np.abs(world(d.motion, "LeftHand")[30:51] - [0.25, 0.3, 1.2]).max() < 1e-4
+    assert np.nanmax(d.report.residual[:, :2]) < 1e-4
+    far = [*FEET, reach((1.5, 0.5, 1.2), ease_in=0.4, ease_out=0.4)]
+    feet = [
+        np.nanmax(least_squares(motion, far, Settings(iterations=40), ratio=r).report.residual[:, :2])
+        for r in (1.0, 100.0)
+    ]
+    assert feet[0] > 5e-3 > 10 * feet[1]
+    assert np.nanmax(deform(motion, far).report.residual[:, :2]) < 1e-5

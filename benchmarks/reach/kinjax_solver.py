@@ -60,4 +60,16 @@ def run_loop(scene: Scene, path: str, k: int) -> Answer:
     return Answer(np.asarray(out.translations[:, 0]), np.asarray(out.rotations))
 
 
-SOLVERS = [Solver("kinjax", run), Solver("kinjax, frame loop alone", run_loop)]
+def run_least_squares(scene: Scene, path: str, k: int) -> Answer:
+    """The same problem by weights of 100 to 1 and optimistix's Levenberg-Marquardt, K steps a frame."""
+    from kinjax.deform import Settings, least_squares
+
+    got = least_squares(scene.motion(), constraints(scene, path), Settings(iterations=k), ratio=100.0)
+    return Answer(got.motion.translations[:, 0], got.motion.rotations)
+
+
+SOLVERS = [
+    Solver("kinjax", run),
+    Solver("kinjax, frame loop alone", run_loop),
+    Solver("optimistix, weights", run_least_squares),
+]

@@ -5,6 +5,7 @@ edit, `deform_many` takes several clips at once.
 """
 
 from .cleaning import clean, constraints_from
+from .comparison import least_squares
 from .constraints import CenterOfMass, Goal, LookAt, Orientation, Position, Through
 from .pipeline import deform, deform_many, redeform
 from .results import STATUSES, Deformation, Report
@@ -26,4 +27,5 @@ __all__ = [
     "deform",
     "deform_many",
     "redeform",
+    "least_squares",
 ]
