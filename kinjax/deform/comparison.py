@@ -16,7 +16,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from ..motion import Motion
 from .chain import Pose, compose, forward, inverse_of, moved, parent_rotations
@@ -53,7 +52,7 @@ def _run(chain: Any, tasks: Any, frames: Any, first: Any, weight: Any, pull: Any
         reference = Reference(x.rotations, x.root, x.controlled, x.root_controlled)
         free = jnp.concatenate([jnp.full(3, x.root_controlled), jnp.repeat(x.controlled, 3)])
 
-        def errors(step: Float[Array, " n"], _: None) -> tuple[Float[Array, "b 3"], Float[Array, " n"]]:
+        def errors(step: Any, _: Any) -> Any:
             pose = moved(chain, start, parent, (free * step)[:, None])
             world = forward(chain, pose, x.offsets)
             r = residuals(tasks, x.goals, look(tasks, x.goals, world), kinds)[..., 0]
