@@ -58,7 +58,7 @@ def _run(chain: Any, tasks: Any, frames: Any, first: Any, weight: Any, pull: Any
             r = residuals(tasks, x.goals, look(tasks, x.goals, world), kinds)[..., 0]
             return r * weight[tasks.layer][:, None], pull * attraction(reference, pose, parent)
 
-        found = optx.least_squares(errors, solver, jnp.zeros_like(free), max_steps=steps, throw=False)
+        found: Any = optx.least_squares(errors, solver, jnp.zeros_like(free), max_steps=steps, throw=False)
         pose = moved(chain, start, parent, (free * found.value)[:, None])
         pose = Pose(
             jnp.where(held, pose.rotations, own.rotations), jnp.where(x.root_controlled > 0, pose.root, own.root)
