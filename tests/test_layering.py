@@ -24,7 +24,8 @@ DETECT = (
 )  # fmt: skip
 DEFORM = (
     "constraints", "settings", "results", "prioritized", "chain", "tasks", "frame_solver", "sequence", "kochanek_bartels",
-    "shape", "recruiting", "targets", "balance", "filtering", "plan", "reuse", "solving", "reporting", "pipeline", "cleaning",
+    "shape", "recruiting", "targets", "balance", "filtering", "plan", "reuse", "solving", "reporting", "pipeline", "comparison",
+    "cleaning",
 )  # fmt: skip
 STRANGERS = ({"detect", "deform"}, {"studio", "cli"}, {"plots", "database"})
 CLI = ("cache", "options", "parse", "show", "request", "detecting", "deforming", "pictures", "commands", "demo")
@@ -76,6 +77,7 @@ def top_level_imports(path: Path, package: Path = PACKAGE) -> list[tuple[tuple[s
 def test_every_file_has_a_place(path: Path):
     module = module_of(path)
     assert module[:1] in ((), ("__main__",)) or module[0] in ORDER, f"{module[0]} has no place in ORDER"
+    assert module[:1] != ("deform",) or module[1:] in ((), *((m,) for m in DEFORM)), f"{module[1]} has no place in DEFORM"
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.relative_to(PACKAGE).as_posix())
