@@ -131,7 +131,7 @@ class Deforming:
     """Where the motion goes: .bvh (the hierarchy and channels of a BVH clip are kept) or .npz."""
     report: Annotated[Path | None, _opt(metavar="FILE", default="none")] = None
     """Also write the report on every constraint and frame (JSON)."""
-    iterations: Annotated[int | None, _opt(metavar="N", default="10")] = None
+    iterations: Annotated[int | None, _opt(metavar="N", default="the edit's, or the solver's own")] = None
     """Iterations of the solver a frame, at most."""
     precision: Annotated[Literal["float64", "float32"] | None, _opt(metavar="{float64,float32}", default="float64")] = None
     """Precision of the solver."""
