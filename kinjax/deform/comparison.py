@@ -36,7 +36,7 @@ def _run(chain: Any, tasks: Any, frames: Any, first: Any, weight: Any, pull: Any
     """A piece of frames: (what the next starts from, (rotations, root, steps taken))."""
     import optimistix as optx
 
-    solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
+    solver: Any = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
 
     def frame(carried: Any, x: Any) -> Any:
         last, before = carried
