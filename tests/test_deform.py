@@ -366,6 +366,13 @@ def test_fir_filter_keeps_what_is_slow():
         (LookAt("Head", at=(1, 1, 1), axis=(0, 0, 0)), ShapeError, "zero"),
         (CenterOfMass(recruit_to="Spine"), OptionError, "recruits"),
         (CenterOfMass(support=("LeftFoot",), at=(0, 0, 1)), OptionError, "support"),
+        (CenterOfMass(support="LeftFoot"), OptionError, "one name"),
+        (CenterOfMass(displacement=[]), OptionError, "displacement"),
+        (CenterOfMass(displacement=0.1), OptionError, "displacement"),
+        (Position("Head", path="abc"), ShapeError, "array"),
+        (Position("Head", path=[[1, 2, 3], [1, 2]], begin=0, end=1), ShapeError, "array"),
+        (Position("Head", through=Through(3, (0, 1, 0))), OptionError, "tuple of Through"),
+        (Position("Head", at=(0, 0, 1), ease_in="x"), OptionError, "ease_in"),
     ],
     ids=lambda x: x if isinstance(x, str) else "",
 )
@@ -373,6 +380,21 @@ def test_errors_say_what_and_where(motion, goal, error, words):
     with pytest.raises(error) as caught:
         deform(motion, [replace(goal, name="my goal")])
     assert "my goal" in str(caught.value) and words in str(caught.value)
+
+
+def test_what_is_no_list_of_constraints_is_refused(motion):
+    with pytest.raises(OptionError, match="list"):
+        deform(motion, Position("Head"))
+    with pytest.raises(OptionError, match="a str is no constraint"):
+        deform(motion, ["x"])
+    deform(motion, [replace(FEET[0], priority=np.int64(2))])
+
+
+def test_another_skeleton_is_solved_anew(motion, reached):
+    """The same rotations on longer bones: nothing of the earlier run is taken over."""
+    big = replace(motion, skeleton=replace(FIGURE, offsets=1.1 * OFFSETS))
+    goals = [*FEET, reach()]
+    assert np.abs(redeform(reached, big, goals).motion.rotations - deform(big, goals).motion.rotations).max() < 1e-9
 
 
 def test_recruiting_rule_names_both_and_the_joints(motion):

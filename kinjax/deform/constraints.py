@@ -127,7 +127,9 @@ Goal = Position | Orientation | LookAt | CenterOfMass
 
 def title(goal: Goal, index: int) -> str:
     """How messages and reports call a constraint: its name, or its kind, joint and place in the list (from 1)."""
+    kind = {"Position": "position", "Orientation": "orientation", "LookAt": "look-at", "CenterOfMass": "centre of mass"}
+    if type(goal).__name__ not in kind:
+        return f"constraint {index + 1}"
     if goal.name:
         return goal.name
-    kind = {"Position": "position", "Orientation": "orientation", "LookAt": "look-at", "CenterOfMass": "centre of mass"}
     return f"{index + 1} {kind[type(goal).__name__]}" + (f" {goal.joint}" if goal.joint else "")

@@ -47,7 +47,7 @@ def deform(
     all). Raises `KinjaxError`s for what cannot be meant, before anything is compiled; targets out of reach and frames that
     are not finite are no errors but a status in the report.
     """
-    return _deform(motion, tuple(constraints), settings or Settings(), progress, ())
+    return _deform(motion, constraints, settings or Settings(), progress, ())
 
 
 def redeform(
@@ -57,7 +57,7 @@ def redeform(
     only frames that the difference can reach are solved again."""
     if not isinstance(previous.again, Again):
         raise ShapeError("the deformation to start from does not hold what it was made of: make it with deform")
-    return _deform(motion, tuple(constraints), previous.again.settings, progress, previous.again.runs)
+    return _deform(motion, constraints, previous.again.settings, progress, previous.again.runs)
 
 
 def deform_many(
@@ -109,7 +109,7 @@ def _shape(plan: Plan) -> object:
 
 
 def _deform(
-    motion: Motion, constraints: tuple[Goal, ...], settings: Settings, progress: Progress | None, old: tuple[Run, ...]
+    motion: Motion, constraints: Sequence[Goal], settings: Settings, progress: Progress | None, old: tuple[Run, ...]
 ) -> Deformation:
     total, done = motion.frames, 0
 

@@ -21,7 +21,7 @@ from ..motion import Motion
 from ..skeleton import Topology
 from .balance import balance_offsets, displacement_path
 from .chain import Chain
-from .constraints import CenterOfMass, Goal, LookAt, Orientation, Position, title
+from .constraints import CenterOfMass, Goal, LookAt, Orientation, Position, Through, title
 from .recruiting import chain_of, check_rule, recruited
 from .sequence import Frames
 from .settings import Settings
@@ -165,6 +165,8 @@ def filled(q: np.ndarray) -> np.ndarray:
 def make_plan(motion: Motion, goals: Sequence[Goal], settings: Settings) -> Plan:
     """Check the constraints against the motion and lay them out; raises `KinjaxError`s that name the constraint."""
     _check_motion(motion)
+    if isinstance(goals, Position | Orientation | LookAt | CenterOfMass):
+        raise OptionError(f"a {type(goals).__name__} was given: put constraints in a list")
     body = Body(motion)
     top = body.top
     titles = tuple(title(g, i) for i, g in enumerate(goals))
@@ -289,8 +291,15 @@ def _check_common(goal: Goal, name: str) -> None:
         raise OptionError(f"{name}: a {type(goal).__name__} is no constraint")
     for what in ("priority", "weight"):
         value = getattr(goal, what)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+        if not number or not np.isfinite(value):
             raise OptionError(f"{name}: {what}={value!r} is not a finite number")
+    for what in ("recruits", "support"):
+        if isinstance(getattr(goal, what, None), str):
+            raise OptionError(f"{name}: {what}={getattr(goal, what)!r} is one name: give a tuple of names")
+    through = getattr(goal, "through", ())
+    if not isinstance(through, tuple | list) or any(not isinstance(t, Through) for t in through):
+        raise OptionError(f"{name}: through={through!r} must be a tuple of Through")
     if goal.weight < 0:
         raise OptionError(f"{name}: weight={goal.weight} is negative; 0 switches a constraint off")
 
@@ -384,6 +393,10 @@ def _center_path(goal: CenterOfMass, name: str, span: Span, body: Body, to_ref) 
 def _in_seconds(goal: CenterOfMass, body: Body):
     """The displacement with its key frames, if it has any, as times."""
     keys: Any = goal.displacement
+    if not isinstance(keys, np.ndarray) and (np.ndim(keys) == 0 if np.isscalar(keys) else not len(keys)):
+        raise OptionError(
+            f"displacement={keys!r}: three numbers, one row a frame, or (frame, three numbers) are needed"
+        )
     if isinstance(keys, np.ndarray) or np.isscalar(keys[0]):
         return keys
     return [(k[0] / body.rate, k[1]) for k in keys] if np.ndim(keys[0][1]) else keys

@@ -90,7 +90,7 @@ class Report:
 
     def rms_change(self) -> float:
         """Root mean square change of all joints over all frames, radians."""
-        return float(np.sqrt(np.nanmean(self.change**2))) if self.change.size else 0.0
+        return float(np.sqrt(np.nanmean(self.change**2))) if np.isfinite(self.change).any() else 0.0
 
     def __str__(self) -> str:
         head = f"{'constraint':<28} {'layer':>5} {'frames':>6} {'largest':>12} {'at frame':>8} {'mean':>12}  status"
@@ -105,8 +105,9 @@ class Report:
             )
         joint, angle, frame = self.largest_change()
         if joint:
+            root = float(np.max(self.root_change, initial=0.0, where=np.isfinite(self.root_change)))
             lines.append(
-                f"largest change: {joint} {np.degrees(angle):.1f} deg in frame {frame}; root {1e3 * np.nanmax(self.root_change):.1f} mm; "
+                f"largest change: {joint} {np.degrees(angle):.1f} deg in frame {frame}; root {1e3 * root:.1f} mm; "
                 f"all joints {np.degrees(self.rms_change()):.2f} deg RMS"
             )
         return "\n".join([*lines, *self.notes])

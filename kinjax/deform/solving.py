@@ -157,6 +157,7 @@ def _unchanged(frames: Any, asked: list[bytes], plan: Plan, old: Run | None) -> 
     same = np.array([a == b for a, b in zip(asked, old.asked, strict=True)])
     ours, theirs = _shared(plan, old.plan)
     same &= (frames.rotations[:, :, ours] == old.frames.rotations[:, :, theirs]).all((1, 2))
+    same &= (frames.offsets[:, ours] == old.frames.offsets[:, theirs]).all((1, 2))
     for name in ("root", "warm"):
         same &= (getattr(frames, name) == getattr(old.frames, name)).reshape(len(same), -1).all(1)
     return same & (frames.goals.root_free == old.frames.goals.root_free)

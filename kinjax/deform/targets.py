@@ -51,7 +51,7 @@ def span_of(goal: Goal, title: str, frames: int, rate: float) -> Span:
             why = "a curve through points has its own" if own else "what keeps its trajectory has nothing to ease"
             raise OptionError(f"{title}: {name} is for at and offset; {why}: leave it out")
         value = (0.0 if own or kept else EASE) if value is None else value
-        if not np.isfinite(value) or value < 0:
+        if not isinstance(value, int | float | np.integer | np.floating) or not np.isfinite(value) or value < 0:
             raise OptionError(f"{title}: {name}={value} is not a number of seconds from 0")
         eases.append(int(np.ceil(value * rate - 1e-9)))
     return Span(begin, end, max(begin - eases[0], 0), min(end + eases[1], frames - 1))
@@ -88,7 +88,10 @@ def vector(value: object, width: int, what: str, title: str) -> np.ndarray:
 
 
 def _path(value: object, span: Span, width: int, title: str) -> np.ndarray:
-    path = np.asarray(value, float)
+    try:
+        path = np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise ShapeError(f"{title}: path must be an array of numbers with one row a frame") from None
     want = (span.end - span.begin + 1, width)
     if path.shape != want:
         raise ShapeError(f"{title}: path has shape {path.shape}; frames {span.begin}..{span.end} need {want}")
