@@ -14,6 +14,14 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 DATA = Path(os.environ.get("KINJAX_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 
 
+@pytest.fixture(autouse=True, scope="module")
+def compiled_programs_are_let_go():
+    """Each compiled program holds memory maps, of which a process may have some 65,000: with those of all test files kept, XLA's
+    compiler crashes."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def x64():
     """float64 for one test; float32 is restored after it."""
