@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from . import quaternions
 from .errors import OptionError, ShapeError, find_name
 from .motion import Motion, Poses
 from .numerics import bucket
@@ -100,8 +101,7 @@ def object_poses(motion: Motion, names: Sequence[str] | None = None, origin: str
     rotation, position = rotation[:, at], position[:, at]
     if origin == "segment":
         center = motion.skeleton.segment_centers()[at].astype(position.dtype)
-        q = np.moveaxis(rotation, -1, 0)
-        position = position + _rotate_numpy(q, center)
+        position = position + quaternions.rotate(rotation, center)
     valid = np.isfinite(rotation).all(-1) & np.isfinite(position).all(-1)
     return Poses(rotation, position, valid, motion.rate, tuple(top.names[i] for i in at), motion.name, top.up)
 
@@ -129,13 +129,6 @@ def _forward_padded(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     shifted = {top.translated[k] for k in roots}
     back = np.array([[1.0 if r in shifted else 0.0] for r in tree]) * away
     return np.asarray(rotation)[:frames], np.asarray(position, float)[:frames] + back
-
-
-def _rotate_numpy(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Rotate (objects, 3) vectors by (4, frames, objects) quaternions, on the host."""
-    u = np.moveaxis(q[1:], 0, -1)
-    t = 2 * np.cross(u, np.broadcast_to(v, u.shape))
-    return v + q[0][..., None] * t + np.cross(u, t)
 
 
 def cluster_poses(

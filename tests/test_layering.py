@@ -14,7 +14,7 @@ HEAVY = ("jax", "jaxlib", "numpy", "scipy", "matplotlib", "pyarrow", "duckdb", "
 
 # From the foundations to what touches disk, argv and browsers. A name is a module, or a folder and all in it.
 ORDER = (
-    "errors", "numerics", "rotations", "splines", "annotations", "skeleton", "anthropometry", "motion", "kinematics",
+    "errors", "numerics", "rotations", "quaternions", "splines", "annotations", "skeleton", "anthropometry", "motion", "kinematics",
     "synthetic", "detect", "deform", "soft", "formats", "database", "plots", "report", "studio", "cli",
 )  # fmt: skip
 # Inside detect/, deform/ and cli/, the same; in detect/ a file that is not named here gathers the others.

@@ -31,12 +31,12 @@ from scipy.spatial.transform import Rotation
 from ..annotations import Annotations, Constraint
 from ..errors import OptionError, find_name
 from ..motion import Motion
+from ..quaternions import from_turns, turns
 from .constraints import Goal, Orientation, Position
 from .pipeline import deform
 from .plan import Body
 from .results import Deformation
 from .settings import Settings
-from .targets import quaternions, rotations
 
 EASE = 0.1
 """Seconds in which a joint is brought to its held place before a constraint, and let go after it."""
@@ -117,11 +117,11 @@ class _Held:
             at = find_name(relative_to, self.top.names, "joint", motion.name)
             self.reference = self.top.names[at]
             finite = np.isfinite(body.rotation[:, at]).all(1)
-            back = rotations(np.where(finite[:, None], body.rotation[:, at], [1.0, 0, 0, 0])).inv()
+            back = turns(body.rotation[:, at]).inv()
             self.origin = np.stack(
                 [back.apply(self.origin[:, j] - self.origin[:, at]) for j in range(motion.joints)], axis=1
             )
-            turned = [quaternions(back * _rotations(self.rotation[:, j])) for j in range(motion.joints)]
+            turned = [from_turns(back * turns(self.rotation[:, j])) for j in range(motion.joints)]
             self.rotation = np.stack(turned, axis=1)
             self.origin[~finite] = np.nan
 
@@ -157,7 +157,7 @@ class _Held:
         known = np.isfinite(q).all(1) & np.isfinite(p).all(1)
         if not known.any():
             raise OptionError(f"{self.top.names[joint]} is nowhere finite in frames {begin}..{end}: nothing to hold")
-        return rotations(q[known]), p[known]
+        return turns(q[known]), p[known]
 
     def mean_pose(self, joint: int, begin: int, end: int) -> tuple[Rotation, np.ndarray]:
         """The mean rotation of a joint, and the mean place of its segment's centre."""
@@ -189,7 +189,7 @@ class _Held:
             spans = [(s.begin, s.end) for k, s in enumerate(rests) if k != i and s.joint == r.joint]
             goals.append(
                 Orientation(
-                    self.top.names[r.joint], at=_vector(quaternions(r.turn)), begin=r.begin, end=r.end,
+                    self.top.names[r.joint], at=_vector(from_turns(r.turn)), begin=r.begin, end=r.end,
                     priority=priority, relative_to=self.reference, name=self._title(r.joint, "turn", r.begin, r.end),
                     **self._eases(r.begin, r.end, spans),
                 )
@@ -220,7 +220,7 @@ class _Held:
     def _local(self, joint: int, body: int) -> np.ndarray:
         """The origin of a joint in its parent's frame, the mean over the clip: it may have channels of its own."""
         known = np.isfinite(self.origin[:, (joint, body)]).all((1, 2)) & np.isfinite(self.rotation[:, body]).all(1)
-        turn, away = rotations(self.rotation[known, body]), self.origin[known, joint] - self.origin[known, body]
+        turn, away = turns(self.rotation[known, body]), self.origin[known, joint] - self.origin[known, body]
         return turn.inv().apply(away).mean(0)
 
     # ---- lines and points
@@ -308,10 +308,6 @@ def _longest_free(begin: int, end: int, busy: Iterable[tuple[int, int]]) -> tupl
         return begin, begin - 1
     first, last = edges[(edges[:, 1] - edges[:, 0]).argmax()]
     return begin + int(first), begin + int(last) - 1
-
-
-def _rotations(q: np.ndarray) -> Rotation:
-    return rotations(np.where(np.isfinite(q).all(-1, keepdims=True), q, [1.0, 0, 0, 0]))
 
 
 def _vector(v: np.ndarray) -> tuple[float, ...]:

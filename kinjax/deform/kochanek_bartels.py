@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..quaternions import exponential, inverse, multiply, rotate
+
 _LONGEST_LEG = 1.8 * np.pi  # radians; beyond a whole turn the slerp of a leg would turn the other way
 
 
@@ -132,29 +134,6 @@ def one_hemisphere(quaternions: np.ndarray) -> np.ndarray:
     q = quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True)
     q[1:] *= np.cumprod(np.where(np.sum(q[1:] * q[:-1], -1) < 0, -1.0, 1.0))[:, None]
     return q
-
-
-def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Hamilton product (..., 4): first `b`, then `a`."""
-    aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
-    return np.concatenate([aw * bw - np.sum(av * bv, -1, keepdims=True), aw * bv + bw * av + np.cross(av, bv)], -1)
-
-
-def inverse(q: np.ndarray) -> np.ndarray:
-    """Inverse of unit quaternions (..., 4)."""
-    return q * np.array([1.0, -1, -1, -1])
-
-
-def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Vectors (..., 3) turned by unit quaternions (..., 4)."""
-    t = 2 * np.cross(q[..., 1:], v)
-    return v + q[..., :1] * t + np.cross(q[..., 1:], t)
-
-
-def exponential(v: np.ndarray) -> np.ndarray:
-    """Quaternions (..., 4) of rotation vectors (..., 3), full angle; continued beyond half a turn."""
-    half = np.linalg.norm(v, axis=-1, keepdims=True) / 2
-    return np.concatenate([np.cos(half), np.sinc(half / np.pi) / 2 * v], -1)
 
 
 def logarithm(q: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import OptionError, ShapeError
 from ..motion import Motion
+from ..quaternions import from_turns, turns
 from .constraints import Goal
 from .filtering import low_pass, roughness, taps
 from .plan import Plan, make_plan
@@ -25,7 +26,6 @@ from .results import Deformation
 from .reuse import signatures
 from .settings import Settings
 from .solving import Run, solve, solve_many
-from .targets import quaternions, rotations
 
 Progress = Callable[[int, int], None]
 
@@ -186,10 +186,10 @@ def smoothed(plan: Plan, solved: Any, settings: Settings, rate: float) -> Any:
             root, rough, held = frames.root + low_pass(moved, fir), True, True
     if settings.filter_joints is not None:
         fir = taps(settings.filter_joints, settings.filter_width, rate)
-        r0, r1 = (rotations(np.moveaxis(q, 1, 2).reshape(-1, 4)) for q in (frames.rotations, solved.rotations))
+        r0, r1 = (turns(np.moveaxis(q, 1, 2)) for q in (frames.rotations, solved.rotations))
         v = (r1 * r0.inv()).as_rotvec().reshape(len(root), -1, 3)
         if roughness(v, fir) > settings.rough:
-            q = quaternions(Rotation.from_rotvec(low_pass(v, fir).reshape(-1, 3)) * r0)
+            q = from_turns(Rotation.from_rotvec(low_pass(v, fir).reshape(-1, 3)) * r0)
             turned, rough = np.moveaxis(q.reshape(len(root), -1, 4), 2, 1), True
     if not rough:
         return None

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from ..anthropometry import SegmentMasses, leg_length, segment_masses
 from ..errors import KinjaxError, OptionError, ShapeError, UnknownNameError, find_name
 from ..motion import Motion
+from ..quaternions import from_turns, known, multiply, rotate, turns
 from ..skeleton import Topology
 from .balance import balance_offsets, displacement_path
 from .chain import Chain
@@ -25,7 +26,7 @@ from .constraints import CenterOfMass, Goal, LookAt, Orientation, Position, Thro
 from .recruiting import chain_of, check_rule, recruited
 from .sequence import Frames
 from .settings import Settings
-from .targets import Path, Span, look_path, place_path, quaternions, rotations, span_of, turn_path, vector
+from .targets import Path, Span, look_path, place_path, span_of, turn_path, vector
 from .tasks import CENTER_OF_MASS, LOOK_AT, ORIENTATION, POSITION, Goals, Kinds, Tasks
 
 
@@ -77,28 +78,28 @@ class Body:
         self._world: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def _at(self, joint: int) -> tuple[np.ndarray, np.ndarray]:
-        """World quaternion (4, F) and place (3, F) of a joint."""
+        """World quaternions (F, 4) and places (F, 3) of a joint."""
         missing = [j for j in chain_of(self.top, joint) if j not in self._world]
         for j in reversed(missing):
-            q = np.ascontiguousarray(np.asarray(self.motion.rotations[:, j], float).T)
+            q = np.asarray(self.motion.rotations[:, j], float)
             if j in self.top.translated:
-                own = np.asarray(self.motion.translations[:, self.top.translated.index(j)], float).T
+                own = np.asarray(self.motion.translations[:, self.top.translated.index(j)], float)
             else:
-                own = np.asarray(self.motion.skeleton.offsets[j], float)[:, None]
+                own = np.asarray(self.motion.skeleton.offsets[j], float)
             if self.top.parents[j] < 0:
-                self._world[j] = q, own - self.origin[:, None]
+                self._world[j] = q, np.broadcast_to(own - self.origin, (self.frames, 3))
             else:
                 up, place = self._world[self.top.parents[j]]
-                self._world[j] = _product(up, q), place + _turned(up, own)
+                self._world[j] = multiply(up, q), place + rotate(up, own)
         return self._world[joint]
 
     def turn(self, joint: int) -> np.ndarray:
         """World quaternions (F, 4) of a joint."""
-        return self._at(joint)[0].T
+        return self._at(joint)[0]
 
     def place(self, joint: int) -> np.ndarray:
         """World places (F, 3) of a joint, less the origin."""
-        return self._at(joint)[1].T
+        return self._at(joint)[1]
 
     @property
     def rotation(self) -> np.ndarray:
@@ -113,7 +114,7 @@ class Body:
     def lost(self, joint: int) -> np.ndarray:
         """(F,) where a joint's pose is not finite."""
         q, p = self._at(joint)
-        return ~(np.isfinite(q).all(0) & np.isfinite(p).all(0))
+        return ~(np.isfinite(q).all(1) & np.isfinite(p).all(1))
 
     @property
     def masses(self) -> SegmentMasses:
@@ -126,40 +127,13 @@ class Body:
     def point(self, joint: int, local: np.ndarray) -> np.ndarray:
         """World path (F, 3) of a point of a joint."""
         q, p = self._at(joint)
-        return (p + _turned(q, np.asarray(local, float)[:, None])).T if np.any(local) else p.T
+        return p + rotate(q, np.asarray(local, float)) if np.any(local) else p
 
     def center(self) -> np.ndarray:
         """World path (F, 3) of the centre of mass."""
         m = self.masses
         parts = [f * self.point(j, c) for j, (f, c) in enumerate(zip(m.fractions, m.centers, strict=True)) if f > 0]
         return np.sum(parts, axis=0)
-
-
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Hamilton product of quaternions (4, F)."""
-    aw, ax, ay, az = a
-    bw, bx, by, bz = b
-    return np.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ]
-    )
-
-
-def _turned(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Vectors (3, F or 1) turned by quaternions (4, F)."""
-    w, x, y, z = q
-    a, b, c = v
-    ta, tb, tc = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
-    return np.stack([a + w * ta + y * tc - z * tb, b + w * tb + z * ta - x * tc, c + w * tc + x * tb - y * ta])
-
-
-def filled(q: np.ndarray) -> np.ndarray:
-    """Frames that are not finite as the identity: SciPy takes no others. Their places stay as they are, and flag them."""
-    return np.where(np.isfinite(q).all(-1, keepdims=True), q, np.array([1.0, 0, 0, 0]))
 
 
 def make_plan(motion: Motion, goals: Sequence[Goal], settings: Settings) -> Plan:
@@ -338,9 +312,9 @@ def _task(goal: Goal, name: str, span: Span, body: Body) -> Asked:
         if reference < 0 and (goal.at is not None or goal.through or goal.path is not None):
             path = _from_origin(goal, name, span, body, joint, point)
     elif isinstance(goal, Orientation):
-        own = filled(body.turn(joint))
+        own = known(body.turn(joint))
         if reference >= 0:
-            own = quaternions(rotations(filled(body.turn(reference))).inv() * rotations(own))
+            own = from_turns(turns(body.turn(reference)).inv() * turns(own))
         kind, path = ORIENTATION, turn_path(goal, name, span, own, body.rate)
         path.goal[body.lost(joint)] = np.nan
     else:
@@ -362,8 +336,8 @@ def _relative(body: Body, reference: int):
     """World paths (F, 3) as seen from the reference joint's moving frame."""
     if reference < 0:
         return lambda x: x
-    inverse = rotations(filled(body.turn(reference))).inv()
-    return lambda x: inverse.apply(x - body.place(reference))
+    back = turns(body.turn(reference)).inv()
+    return lambda x: back.apply(x - body.place(reference))
 
 
 def _from_origin(goal: Position, name: str, span: Span, body: Body, joint: int, point: np.ndarray) -> Path:

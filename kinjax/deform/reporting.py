@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..motion import Motion
-from .plan import Body, Plan, filled
+from ..quaternions import turns
+from .plan import Body, Plan
 from .results import CONFLICT, CONVERGED, FREE, MAX_ITER, NONFINITE, STALLED, UNREACHABLE, Report
 from .settings import Settings
-from .targets import rotations
 from .tasks import CENTER_OF_MASS, LOOK_AT, ORIENTATION, RADIAN
 
 BLOCKED = 0.03
@@ -30,13 +30,13 @@ def residual_table(motion: Motion, plan: Plan) -> Float[np.ndarray, "f b"]:
     for k, b in enumerate(plan.slot):
         joint = int(plan.kept[tasks.joint[b]])
         world = tasks.reference[b] == len(plan.chain.parents)
-        back = None if world else rotations(filled(body.turn(int(plan.kept[tasks.reference[b]])))).inv()
+        back = None if world else turns(body.turn(int(plan.kept[tasks.reference[b]]))).inv()
         origin = 0.0 if world else body.place(int(plan.kept[tasks.reference[b]]))
         axes = tasks.scale[b] > 0
-        seen = rotations(filled(body.turn(joint)))
+        seen = turns(body.turn(joint))
         if tasks.kind[b] == ORIENTATION:
             own = seen if back is None else back * seen
-            goal = rotations(filled(goals.rotation[:, b]))
+            goal = turns(goals.rotation[:, b])
             off = (goal * own.inv()).as_rotvec() * axes
             value = np.linalg.norm(off, axis=1)
         else:
@@ -94,7 +94,7 @@ def make_report(before: Motion, after: Motion, plan: Plan, solved: Any, settings
     code[:, list(plan.order)] = status
     q0, q1 = np.asarray(before.rotations, float), np.asarray(after.rotations, float)
     joints = q0.shape[1]
-    turn = rotations(filled(q1.reshape(-1, 4))) * rotations(filled(q0.reshape(-1, 4))).inv()
+    turn = turns(q1) * turns(q0).inv()
     change = turn.magnitude().reshape(f, joints)
     change[~(np.isfinite(q0).all(-1) & np.isfinite(q1).all(-1))] = np.nan
     top = before.skeleton.topology

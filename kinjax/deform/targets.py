@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import OptionError, ShapeError
+from ..quaternions import from_turns, turns
 from .constraints import Goal, LookAt, Orientation, Position, Through
 from .shape import Pass, orientation_curve, shape_curve
 
@@ -198,7 +199,7 @@ def turn_path(goal: Orientation, title: str, span: Span, own: np.ndarray, rate: 
         return Path(active, out)
     if goal.offset is not None:
         v = ramp(span, frames)[:, None] * vector(goal.offset, 3, "offset", title)
-        return Path(active, quaternions(Rotation.from_rotvec(v) * rotations(own)))
+        return Path(active, from_turns(Rotation.from_rotvec(v) * turns(own)))
     passes = goal.through
     if goal.at is not None:
         passes = (Through(span.begin, _unit(vector(goal.at, 4, "at", title), "at", title), span.end),)
@@ -208,7 +209,7 @@ def turn_path(goal: Orientation, title: str, span: Span, own: np.ndarray, rate: 
     if span.first == span.last:
         return Path(active, np.broadcast_to(np.asarray(points[0].point, float), own.shape).copy())
     a, b = span.first, span.last
-    r = rotations(own)
+    r = turns(own)
     speed = np.zeros((frames, 3))
     speed[:-1] = (r[1:] * r[:-1].inv()).as_rotvec() * rate
     speed[-1] = speed[max(frames - 2, 0)]
@@ -230,13 +231,3 @@ def look_path(goal: LookAt, title: str, span: Span, eye: np.ndarray, along: np.n
     far = np.linalg.norm(at - eye, axis=1, keepdims=True)
     s = ramp(span, len(eye))[:, None]
     return Path(active, s * at + (1 - s) * (eye + far * along))
-
-
-def rotations(q: np.ndarray) -> Rotation:
-    """SciPy rotations of quaternions wxyz."""
-    return Rotation.from_quat(np.asarray(q)[..., [1, 2, 3, 0]])
-
-
-def quaternions(r: Rotation) -> np.ndarray:
-    """Quaternions wxyz of SciPy rotations."""
-    return r.as_quat()[..., [3, 0, 1, 2]]

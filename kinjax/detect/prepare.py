@@ -18,6 +18,7 @@ from ..errors import OptionError, ShapeError, find_name
 from ..kinematics import object_poses
 from ..motion import Motion, Poses
 from ..numerics import BLOCK, bucket
+from ..quaternions import from_turns, turns
 from .interface import Clip, Joints
 from .settings import Settings
 
@@ -67,17 +68,13 @@ def as_poses(source: Motion | Poses, objects: Sequence[str] | None, relative_to:
     if not others:
         raise OptionError(f"relative_to={relative_to!r} leaves no object to look at")
     q, t = np.asarray(poses.rotation, float), np.asarray(poses.position, float)
-    inverse = q[:, reference] * np.array([1.0, -1, -1, -1])
-    from scipy.spatial.transform import Rotation
-
     seen = np.asarray(poses.valid)[:, reference]
-    turn = Rotation.from_quat(np.where(seen[:, None], inverse, [1.0, 0, 0, 0])[:, [1, 2, 3, 0]])
+    back = turns(np.where(seen[:, None], q[:, reference], np.nan)).inv()
     rotation, position = np.empty((len(q), len(others), 4)), np.empty((len(q), len(others), 3))
     for k, i in enumerate(others):
         ok = np.asarray(poses.valid)[:, i]
-        own = Rotation.from_quat(np.where(ok[:, None], q[:, i], [1.0, 0, 0, 0])[:, [1, 2, 3, 0]])
-        rotation[:, k] = (turn * own).as_quat()[:, [3, 0, 1, 2]]
-        position[:, k] = turn.apply(np.where((ok & seen)[:, None], t[:, i] - t[:, reference], 0))
+        rotation[:, k] = from_turns(back * turns(np.where(ok[:, None], q[:, i], np.nan)))
+        position[:, k] = back.apply(np.where((ok & seen)[:, None], t[:, i] - t[:, reference], 0))
     return replace(
         poses,
         rotation=rotation,
