@@ -9,15 +9,14 @@ names gets mass by bone length, and a note that says so. Host NumPy, float64.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
-from functools import lru_cache
-from itertools import pairwise, takewhile
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
 
 from .errors import OptionError, ShapeError
+from .joint_names import find_body, path_between, words_of
 from .skeleton import Skeleton
 
 # Mass of one (a fraction of the body's), and its centre from the proximal end (a fraction of its length). Head and trunk
@@ -48,46 +47,8 @@ _TRUNK = {
     "male": ((0.1117, 0.1457, 1 - 0.6115), (0.1633, 0.2155, 1 - 0.4502), (0.1596, 0.2421, 1 - 0.5066)),
     "female": ((0.1247, 0.1815, 1 - 0.4920), (0.1465, 0.2053, 1 - 0.4512), (0.1545, 0.2280, 1 - 0.5050)),
 }
-# What a joint is called that carries a part, the surest names first: "leg" is the shank of who has a thigh, "shoulder"
-# the upper arm of who has no other, the wrist is where the hand begins.
-_NAMES = {
-    "thigh": ("upleg", "upperleg", "thigh", "femur", "hip", "hipjoint", "leg"),
-    "shank": ("lowleg", "lowerleg", "shin", "calf", "tibia", "shank", "knee", "kneejoint", "leg"),
-    "foot": ("ankle", "anklejoint", "foot"),
-    "upper arm": ("uparm", "upperarm", "humerus", "shldr", "arm", "shoulder", "shoulderjoint"),
-    "forearm": ("forearm", "lowarm", "lowerarm", "radius", "ulna", "elbow", "elbowjoint"),
-    "hand": ("wrist", "wristjoint", "hand"),
-}
-_NECK = ("neck", "lowerneck", "upperneck", "necklower", "neckbase", "neckupper")
-_HEAD = ("head", "skull")
-_SIDES = {"left": "left", "l": "left", "lft": "left", "right": "right", "r": "right", "rgt": "right"}
-_KNOWN = {w for ws in _NAMES.values() for w in ws}
-_NOISE = {
-    "bip",
-    "biped",
-    "jnt",
-    "jt",
-    "fk",
-    "ik",
-    "bn",
-    "bone",
-    "def",
-    "org",
-    "mixamorig",
-    "avg",
-    "base",
-    "cc",
-    "rl",
-    "m",
-    "f",
-    "b",
-    "c",
-    "j",
-}
-
 # a joint, and a stretch of its part in its own frame
 _Piece = tuple[int, np.ndarray, np.ndarray]
-_Side = dict[str, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +82,7 @@ def segment_masses(skeleton: Skeleton, table: str = "male") -> SegmentMasses:
             return SegmentMasses(given, centers, "skeleton")
         between = skeleton.segment_centers().astype(float)
         return SegmentMasses(given, between, "skeleton", ("mass centres: half-way along each joint's bones",))
-    body = _find_body(skeleton)
+    body = find_body(skeleton.topology)
     notes: tuple[str, ...]
     if body is None:
         fractions, found = _by_bone_length(skeleton)
@@ -143,7 +104,7 @@ def segment_masses(skeleton: Skeleton, table: str = "male") -> SegmentMasses:
 
 def leg_length(skeleton: Skeleton) -> float:
     """Hip to ankle along the bones, metres, the mean of both legs; `OptionError` if the names tell no legs."""
-    body = _find_body(skeleton)
+    body = find_body(skeleton.topology)
     if body is None:
         raise OptionError("the joints' names do not tell the legs: give the leg length")
     both = []
@@ -175,69 +136,8 @@ def _own(skeleton: Skeleton) -> tuple[np.ndarray | None, np.ndarray | None]:
     return fractions, centers
 
 
-@lru_cache(maxsize=64)
-def _words(names: tuple[str, ...]) -> list[tuple[str, str]]:
-    """Side ("left", "right" or "") and what is left of each name, in small letters without numbers and decoration."""
-    names = tuple(n.split(":")[-1] for n in names)
-    same = list(takewhile(lambda x: x[0] == x[1], zip(min(names), max(names), strict=False)))  # "Bob_" of all names
-    shared = max((i + 1 for i, (c, _) in enumerate(same) if not c.isalnum()), default=0) if len(names) > 1 else 0
-    out = []
-    for name in names:
-        words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name[shared:])
-        words = [w for w in map(str.lower, words) if w not in _NOISE]
-        side = next((_SIDES[w] for w in words if w in _SIDES), "")
-        key = "".join(w for w in words if w not in _SIDES)
-        if not side:  # in one word: lfemur, rightfoot
-            for mark in ("left", "right", "l", "r"):
-                if key.startswith(mark) and key[len(mark) :] in _KNOWN:
-                    side, key = _SIDES[mark], key[len(mark) :]
-                    break
-        out.append((side, key))
-    return out
-
-
-def _find_body(skeleton: Skeleton) -> dict[str, _Side] | None:
-    """Where each part begins: {"left": {...}, "right": {...}, "middle": pelvis, neck, head}; None if it is no body."""
-    parents = skeleton.topology.parents
-    words = _words(skeleton.names)
-    body: dict[str, _Side] = {}
-    for side in ("left", "right"):
-        found: _Side = {}
-        for part, names in _NAMES.items():
-            hits = [(names.index(key), j) for j, (s, key) in enumerate(words) if s == side and key in names]
-            if hits:
-                found[part] = min(hits)[1]
-        if not {"thigh", "shank", "upper arm", "forearm"} <= set(found):
-            return None
-        hand = next((j for j, w in enumerate(words) if w == (side, "hand")), None)
-        if hand is not None and words[found["forearm"]][1] == "radius":
-            found["hand"] = hand  # in ASF files the bone called wrist is the far half of the forearm
-        for chain in (("thigh", "shank", "foot"), ("upper arm", "forearm", "hand")):
-            for a, b in pairwise(chain):
-                if b not in found:
-                    continue
-                if found[a] == found[b] or not _path(parents, found[a], found[b]):
-                    if b in ("shank", "forearm"):
-                        return None
-                    del found[b]
-        body[side] = found
-    pelvis = _common(parents, body["left"]["thigh"], body["right"]["thigh"])
-    if pelvis < 0:
-        return None
-    middle = {"pelvis": pelvis}
-    for part, names in (("neck", _NECK), ("head", _HEAD)):
-        below = [j for j, (s, key) in enumerate(words) if not s and key in names and _path(parents, pelvis, j)]
-        if below:
-            middle[part] = below[0]
-    if len(middle) == 1:
-        return None
-    if len(middle) == 3 and not _path(parents, middle["neck"], middle["head"]):
-        del middle["neck"]
-    return body | {"middle": middle}
-
-
 def _parts(
-    skeleton: Skeleton, body: dict[str, _Side], table: str
+    skeleton: Skeleton, body: dict[str, dict[str, int]], table: str
 ) -> tuple[list[tuple[list[_Piece], list[tuple[float, float, float]]]], tuple[str, ...]]:
     """Each part as the bones that it lies on and its stretches (mass, from, to; fractions of its length), and notes."""
     limbs, trunk, middle = _LIMBS[table], _TRUNK[table], body["middle"]
@@ -299,14 +199,16 @@ def _spread(
 
 def _bones(skeleton: Skeleton, top: int, bottom: int) -> list[_Piece]:
     """The bones from joint `top` down to joint `bottom`."""
-    path, offsets = _path(skeleton.topology.parents, top, bottom), np.asarray(skeleton.offsets, float)
+    path, offsets = path_between(skeleton.topology.parents, top, bottom), np.asarray(skeleton.offsets, float)
     return [(a, np.zeros(3), offsets[b]) for a, b in pairwise(path)]
 
 
-def _below_pelvis(skeleton: Skeleton, body: dict[str, _Side]) -> list[_Piece]:
+def _below_pelvis(skeleton: Skeleton, body: dict[str, dict[str, int]]) -> list[_Piece]:
     """From the middle of the hips up to the joint that carries the pelvis, at rest; nothing where offsets do not tell."""
     pelvis, offsets = body["middle"]["pelvis"], np.asarray(skeleton.offsets, float)
-    hips = [offsets[_path(skeleton.topology.parents, pelvis, body[s]["thigh"])[1:]].sum(0) for s in ("left", "right")]
+    hips = [
+        offsets[path_between(skeleton.topology.parents, pelvis, body[s]["thigh"])[1:]].sum(0) for s in ("left", "right")
+    ]
     # bones all drawn along one axis, as some exporters do, have turned frames at rest: the two hips then coincide
     if np.linalg.norm(hips[0] - hips[1]) < 0.5 * np.linalg.norm(hips[0]):
         return []
@@ -317,7 +219,7 @@ def _tip(skeleton: Skeleton, joint: int, central: bool = False) -> list[_Piece]:
     """The bones from a joint to the farthest tip below it; central: not through what has a side (eyes), or between them."""
     top = skeleton.topology
     offsets, ends = np.asarray(skeleton.offsets, float), np.asarray(skeleton.end_offsets, float)
-    words = _words(top.names)
+    words = words_of(top.names)
     children = top.children(joint)
     best: list[_Piece] = []
     for end in (ends[e] for e, p in enumerate(top.end_parents) if p == joint):
@@ -332,21 +234,6 @@ def _tip(skeleton: Skeleton, joint: int, central: bool = False) -> list[_Piece]:
 
 def _length(pieces: list[_Piece]) -> float:
     return float(sum(np.linalg.norm(b - a) for _, a, b in pieces))
-
-
-def _path(parents: tuple[int, ...], top: int, bottom: int) -> list[int]:
-    """Joints from `top` down to `bottom`, both included; empty if `bottom` is not below `top`."""
-    path = [bottom]
-    while path[-1] > top:
-        path.append(parents[path[-1]])
-    return path[::-1] if path[-1] == top else []
-
-
-def _common(parents: tuple[int, ...], a: int, b: int) -> int:
-    """The nearest joint above both; -1 if they belong to different trees."""
-    while a != b:
-        a, b = (parents[a], b) if a > b else (a, parents[b])
-    return a
 
 
 def _by_bone_length(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:

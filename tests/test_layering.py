@@ -14,7 +14,7 @@ HEAVY = ("jax", "jaxlib", "numpy", "scipy", "matplotlib", "pyarrow", "duckdb", "
 
 # From the foundations to what touches disk, argv and browsers. A name is a module, or a folder and all in it.
 ORDER = (
-    "errors", "numerics", "rotations", "quaternions", "splines", "annotations", "skeleton", "anthropometry", "motion", "kinematics",
+    "errors", "numerics", "rotations", "quaternions", "splines", "annotations", "skeleton", "joint_names", "anthropometry", "motion", "kinematics",
     "synthetic", "detect", "deform", "soft", "formats", "database", "plots", "report", "studio", "cli",
 )  # fmt: skip
 # Inside detect/, deform/ and cli/, the same; in detect/ a file that is not named here gathers the others.
@@ -24,8 +24,8 @@ DETECT = (
 )  # fmt: skip
 DEFORM = (
     "constraints", "settings", "results", "prioritized", "chain", "tasks", "frame_solver", "sequence", "kochanek_bartels",
-    "shape", "recruiting", "targets", "balance", "filtering", "plan", "reuse", "solving", "reporting", "pipeline", "comparison",
-    "cleaning",
+    "shape", "recruiting", "targets", "balance", "filtering", "body", "resolving", "layout", "plan", "reuse", "solving",
+    "reporting", "pipeline", "comparison", "cleaning",
 )  # fmt: skip
 STRANGERS = ({"detect", "deform"}, {"studio", "cli"}, {"plots", "database"})
 CLI = ("cache", "options", "parse", "show", "request", "detecting", "deforming", "pictures", "commands", "demo")

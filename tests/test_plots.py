@@ -67,7 +67,8 @@ def fake_detection(
     segments = Segments(**columns, **places, residual=np.full(found, 0.0021), pattern=np.zeros(found, int))
     return Detection(
         middle=middle, sigma_3=sigma_3, eps_3=eps_3, sigma_1=np.zeros(shape), eps_1=eps_1, valid=valid, passed=passed,
-        template=template, sigma_max=sigma_max, eps_max=eps_max, missing=(~valid).sum(0), segments=segments,
+        template=template, sigma_max=sigma_max, eps_max=eps_max, missing=(~valid).sum(0),
+        noise=np.full((len(names), 2), 1e-3), segments=segments,
         patterns=tuple(patterns), rate=rate, objects=names, frames=frames, clip="walk.bvh", unit="per_second",
         settings=Settings(types=types),
     )  # fmt: skip

@@ -274,6 +274,16 @@ def run_joints(
     return run(plan, numbers, joint_poses(joints), templates, given)
 
 
+@partial(jax.jit, static_argnames="plan")
+def run_clips(
+    plan: Plan, numbers: Numbers, clips: Joints, templates: TemplateSpans, given: tuple[Pattern, ...]
+) -> Found:
+    """Detection in a batch of clips, whose `Joints` have one more axis in front; their objects come one after another."""
+    q, t, seen = jax.lax.map(joint_poses, clips)  # one by one: each has parents of its own
+    world = (x.reshape(*x.shape[:-3], -1, x.shape[-1]) for x in (jnp.moveaxis(q, 1, 0), jnp.moveaxis(t, 1, 0), seen))
+    return run(plan, numbers, Clip(*world), templates, given)
+
+
 def joint_poses(x: Joints) -> Clip:
     """World poses of the joints that are objects, origins at their segments' centres."""
     world = world_transforms(x.rotations, x.moving, x.offsets, x.parents, x.translated)

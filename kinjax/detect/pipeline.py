@@ -11,16 +11,15 @@ from dataclasses import replace
 from typing import Any
 
 import jax
-import numpy as np
 
 from ..annotations import NoisePattern, Template
 from ..errors import OptionError
 from ..motion import Motion, Poses
-from ..numerics import BLOCK, bucket
-from .engine import joint_poses, run_joints, run_poses
-from .interface import Clip, Found, Joints, Plan
+from .batches import lane_name, lanes_of, room_of, shape_of, side_by_side
+from .engine import run_clips, run_joints, run_poses
+from .interface import Found, Joints, Plan
 from .planning import capacity_of, given_patterns, numbers, pivot_patterns, plan_of, template_spans
-from .prepare import Prepared, padded_clip, prepared
+from .prepare import Prepared, prepared
 from .records import detection, kinds_of, pattern_records, unit_of
 from .results import Detection
 from .settings import Settings
@@ -65,23 +64,37 @@ def detect_many(
     """
     settings = (settings or Settings()).but(**changes)
     clips = [prepared(s, objects, None, settings) for s in sources]
-    groups: dict[tuple[int, float], list[int]] = {}
+    return detect_prepared(clips, settings, [patterns] * len(clips))
+
+
+def detect_prepared(
+    clips: Sequence[Prepared], settings: Settings, patterns: Sequence[Sequence[NoisePattern]]
+) -> list[Detection]:
+    """Detection in prepared clips, each with patterns of its own (or none), in batches of one shape.
+
+    Each shape compiles once: batches have a fixed room, and clips with patterns run apart from those without.
+    """
+    groups: dict[tuple[object, ...], list[int]] = {}
     for i, c in enumerate(clips):
-        groups.setdefault((bucket(c.frames + BLOCK), c.rate), []).append(i)
-    out: list[Detection | None] = [None] * len(clips)
+        groups.setdefault((*shape_of(c), bool(patterns[i])), []).append(i)
+    out: dict[int, Detection] = {}
     for members in groups.values():
-        batch, cuts = _side_by_side([clips[i] for i in members])
-        spread = [
-            p.with_object(n)
-            for p in patterns
-            for n in batch.names
-            if n.split("\0")[-1].casefold() == p.object.casefold()
-        ]
-        plan, found = _run(batch, settings, (), spread)
-        host = jax.device_get(found)
-        for i, (begin, end) in zip(members, cuts, strict=True):
-            out[i] = detection(clips[i], settings, plan, _lanes(host, begin, end), (), patterns)
-    return [d for d in out if d is not None]
+        room = room_of(clips[members[0]])
+        for k in range(0, len(members), room):
+            some = members[k : k + room]
+            batch, lanes = side_by_side([clips[i] for i in some], room)
+            spread = [
+                p.with_object(lane_name(n, name))
+                for n, i in enumerate(some)
+                for p in patterns[i]
+                for name in clips[i].names
+                if name.casefold() == p.object.casefold()
+            ]
+            plan, found = _run(batch, settings, (), spread)
+            host = jax.device_get(found)
+            for i, (begin, end) in zip(some, lanes, strict=True):
+                out[i] = detection(clips[i], settings, plan, lanes_of(host, begin, end), (), patterns[i])
+    return [out[i] for i in range(len(clips))]
 
 
 def calibrate(
@@ -136,47 +149,12 @@ def _run(
     plan = replace(plan, templates=slots, template_frames=length)
     pivots = pivot_patterns(patterns, clip)
     arguments = numbers(settings, clip.rate, pivots), clip.arrays, spans, given
-    run = run_joints if isinstance(clip.arrays, Joints) else run_poses
+    run = run_poses
+    if isinstance(clip.arrays, Joints):
+        run = run_joints if clip.arrays.rotations.ndim == 3 else run_clips
     while True:
         found = run(plan, *arguments)
         needed = int(found.overflow)
         if needed <= plan.capacity:
             return plan, found
         plan = replace(plan, capacity=1 << (needed - 1).bit_length())
-
-
-_world = jax.jit(joint_poses)
-
-
-def _side_by_side(clips: Sequence[Prepared]) -> tuple[Prepared, list[tuple[int, int]]]:
-    """Clips of one bucket as one clip with the objects of all; which lanes belong to which."""
-    names = tuple(f"{i}\0{n}" for i, c in enumerate(clips) for n in c.names)
-    counts = [len(c.names) for c in clips]
-    ends = np.cumsum(counts)
-    longest = max(c.frames for c in clips)
-    poses = [c.arrays if isinstance(c.arrays, Clip) else jax.device_get(_world(c.arrays)) for c in clips]
-    parts = [[x[..., :n, :longest] for x in p] for p, n in zip(poses, counts, strict=True)]
-    arrays = padded_clip(*(np.concatenate(x, axis=-2) for x in zip(*parts, strict=True)))
-    batch = replace(
-        clips[0],
-        arrays=arrays,
-        valid=np.asarray(arrays.valid)[: ends[-1], :longest],
-        origin=np.concatenate([c.origin for c in clips]),
-        lanes=arrays.valid.shape[0],
-        names=names,
-        frames=longest,
-        clip="batch",
-    )
-    return batch, [(int(e - n), int(e)) for e, n in zip(ends, counts, strict=True)]
-
-
-def _lanes(found: Found, begin: int, end: int) -> Found:
-    """The part of a batch's result that belongs to some lanes; arrays by object have them first, constraints last."""
-    by_lane = lambda x: x[begin:end]  # noqa: E731
-    last = {"kind", "begin", "end", "position", "axis", "residual"}
-    return Found(
-        **{
-            f: (v if f == "overflow" else v[..., begin:end] if f in last else jax.tree.map(by_lane, v))
-            for f, v in found._asdict().items()
-        }
-    )

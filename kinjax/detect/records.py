@@ -100,6 +100,7 @@ def detection(
         {k: cut(v[0]) for k, v in zip(kinds, host.limits, strict=True)},
         {k: cut(v[1]) for k, v in zip(kinds, host.limits, strict=True)},
         absent + host.missing[:objects],
+        np.stack([x[:objects] for x in host.noise], axis=-1),
         segments,
         tuple(records),
         clip.original_rate,

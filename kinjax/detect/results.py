@@ -48,7 +48,9 @@ class Detection:
     `sigma_3, eps_3, sigma_1, eps_1`: the sigma-epsilon space (paper section 5), per interval or per second as `unit` says
     (rad, m or rad/s, m/s). `valid`: both ends were seen. `passed`: instantaneous constraint, 0 none, 1 space, 2 line.
     `template`: 0 no template here, 1 kept by the estimator, 2 rejected by it. `sigma_max`, `eps_max`: thresholds by
-    type. `missing` (O,): frames masked, by object. `segments`: the constraints as columns; `constraints` as records.
+    type. `missing` (O,): frames masked, by object. `noise` (O, 2): what the data's own noise was measured to be, metres and
+    radians (the root of the summed variances of three components; zero for the paper's method, which measures none).
+    `segments`: the constraints as columns; `constraints` as records.
     """
 
     middle: Float[Array, " n"]
@@ -62,6 +64,7 @@ class Detection:
     sigma_max: dict[ConstraintType, Float[Array, "n objects"]]
     eps_max: dict[ConstraintType, Float[Array, "n objects"]]
     missing: Int[Array, " objects"]
+    noise: Float[Array, "objects 2"]
     segments: Segments
     patterns: tuple[NoisePattern, ...]
     rate: float
