@@ -32,9 +32,9 @@ from ..annotations import Annotations, Constraint
 from ..errors import OptionError, find_name
 from ..motion import Motion
 from ..quaternions import from_turns, turns
+from .body import Body
 from .constraints import Goal, Orientation, Position
 from .pipeline import deform
-from .plan import Body
 from .results import Deformation
 from .settings import Settings
 

@@ -13,7 +13,8 @@ from jaxtyping import Float
 
 from ..motion import Motion
 from ..quaternions import turns
-from .plan import Body, Plan
+from .body import Body
+from .plan import Plan
 from .results import CONFLICT, CONVERGED, FREE, MAX_ITER, NONFINITE, STALLED, UNREACHABLE, Report
 from .settings import Settings
 from .tasks import CENTER_OF_MASS, LOOK_AT, ORIENTATION, RADIAN
