@@ -1,6 +1,7 @@
 """Deformation from constraints to a motion: what is promised of priorities, edits, bad frames, batches and compilations."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -21,7 +22,9 @@ from kinjax.deform import (
     redeform,
     solving,
 )
-from kinjax.deform.filtering import low_pass, roughness, taps
+from kinjax.deform.filtering import bridged, low_pass, roughness, taps
+from kinjax.deform.pipeline import smoothed
+from kinjax.deform.plan import make_plan
 from kinjax.errors import KinjaxError, OptionError, ShapeError, UnknownNameError
 from kinjax.motion import Motion
 
@@ -324,6 +327,70 @@ def test_filter_smooths_what_jumps_and_constraints_hold_again(motion):
     ]
     assert jerk[1] < 0.5 * jerk[0]
     assert np.nanmax(smooth.report.residual[:, :2]) < 2e-4 and np.nanmax(smooth.report.residual[:, 2]) < 1e-3
+
+
+@pytest.mark.parametrize("lost", ["root", "rotation"])
+def test_a_lost_frame_does_not_spread_through_the_filter(motion, lost):
+    """What the filter sees of a lost frame is the displacement between its neighbours': they are as in the whole clip, up to the
+    little that one frame tells, and the lost frame is as it was given."""
+    path = world(motion, "LeftHand").copy()
+    path[40:] += [0.06, 0.0, 0.04]
+    goals = [*FEET, Position("LeftHand", path=path, priority=1)]
+    settings = Settings(filter_joints=4.0)
+    bad = replace(motion, rotations=motion.rotations.copy(), translations=motion.translations.copy())
+    if lost == "root":
+        bad.translations[36, 0] = np.nan
+    else:
+        bad.rotations[36, NAMES.index("Spine")] = np.nan
+    whole, found = deform(motion, goals, settings), deform(bad, goals, settings)
+    assert found.report.passes > 1 and whole.report.passes > 1
+    others = np.arange(FRAMES) != 36
+    for name in ("rotations", "translations"):
+        given, out = (np.asarray(getattr(m, name)) for m in (bad, found.motion))
+        np.testing.assert_array_equal(out[36], given[36])
+        assert np.isfinite(out[others]).all()
+        assert np.abs(out[others] - np.asarray(getattr(whole.motion, name))[others]).max() < 5e-3
+    assert (status(found.report, "nonfinite").any(1) == ~others).all()
+
+
+def test_the_filter_bridges_lost_frames_by_their_neighbours(motion):
+    """The next pass starts at the filtered displacement, that of the lost frame interpolated."""
+    from scipy.spatial.transform import Rotation
+
+    bad = replace(motion, rotations=motion.rotations.copy())
+    bad.rotations[36, NAMES.index("Spine")] = np.nan
+    settings = Settings(filter_joints=4.0, rough=1e-9)
+    plan = make_plan(bad, [reach()], settings)
+    rng = np.random.default_rng(0)
+    frames, n = plan.frames, plan.frames.rotations.shape[2]
+    turns = Rotation.from_rotvec(rng.normal(size=(FRAMES, n, 3)).reshape(-1, 3) * 0.1)
+    own = np.nan_to_num(np.moveaxis(frames.rotations, 1, 2), nan=0.5)
+    turned = (turns * Rotation.from_quat(own.reshape(-1, 4)[:, [1, 2, 3, 0]])).as_quat()[:, [3, 0, 1, 2]]
+    root, rotations = frames.root + rng.normal(size=(FRAMES, 3)), np.moveaxis(turned.reshape(FRAMES, n, 4), 2, 1)
+    root[36], rotations[36] = frames.root[36], frames.rotations[36]  # the frame loop gives back what it cannot solve
+    solved = SimpleNamespace(root=root, rotations=rotations, sound=np.arange(FRAMES) != 36)
+    got = smoothed(plan, solved, settings, float(motion.rate))
+    np.testing.assert_array_equal(got.root[36], frames.root[36])
+    np.testing.assert_array_equal(got.rotations[36], frames.rotations[36])
+    fir, others = taps(4.0, settings.filter_width, float(motion.rate)), np.arange(FRAMES) != 36
+    moved, turn = root - frames.root, turns.as_rotvec().reshape(FRAMES, n, 3).copy()
+    moved[36], turn[36] = (moved[35] + moved[37]) / 2, (turn[35] + turn[37]) / 2
+    np.testing.assert_allclose(got.root[others], (frames.root + low_pass(moved, fir))[others], atol=1e-12)
+    expected = Rotation.from_rotvec(low_pass(turn, fir).reshape(-1, 3)) * Rotation.from_quat(own.reshape(-1, 4)[:, [1, 2, 3, 0]])
+    given = np.moveaxis(got.rotations, 1, 2)[others].reshape(-1, 4)[:, [1, 2, 3, 0]]
+    apart = Rotation.from_quat(given) * expected[np.repeat(others, n)].inv()
+    assert apart.magnitude().max() < 1e-7
+
+
+def test_bridges_are_straight_lines_between_known_frames():
+    rng = np.random.default_rng(0)
+    path, lost = rng.normal(size=(30, 2, 3)), rng.random(30) < 0.5
+    lost[[0, 1, -1]] = True
+    found, t = bridged(np.where(lost[:, None, None], np.nan, path), lost), np.arange(30)
+    for i, j in np.ndindex(2, 3):
+        np.testing.assert_allclose(found[:, i, j], np.interp(t, t[~lost], path[~lost, i, j]), rtol=0, atol=1e-14)
+    assert np.isnan(bridged(np.full((4, 3), np.nan), np.ones(4, bool))).all()
+    assert bridged(path, np.zeros(30, bool)) is path
 
 
 def test_fir_filter_keeps_what_is_slow():

@@ -24,7 +24,7 @@ DETECT = (
 )  # fmt: skip
 DEFORM = (
     "constraints", "settings", "results", "prioritized", "chain", "tasks", "frame_solver", "sequence", "kochanek_bartels",
-    "shape", "recruiting", "targets", "balance", "filtering", "body", "resolving", "layout", "plan", "reuse", "solving",
+    "shape", "recruiting", "filtering", "targets", "balance", "body", "resolving", "layout", "plan", "reuse", "solving",
     "reporting", "pipeline", "comparison", "cleaning",
 )  # fmt: skip
 STRANGERS = ({"detect", "deform"}, {"studio", "cli"}, {"plots", "database"})

@@ -1,13 +1,13 @@
 """Low-pass filtering of what a deformation added, so that neighbouring frames stay alike (2004 paper, section 5.2).
 
 In: the displacement map of the root's translation, or of joint rotations. Out: the same, smoothed by a symmetric FIR filter
-(no delay), constant beyond the clip's ends. Host NumPy.
+(no delay), constant beyond the clip's ends. Frames that are lost are bridged first: a filter would spread them. Host NumPy.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.ndimage import correlate1d
 from scipy.signal import firwin
 
@@ -30,9 +30,18 @@ def low_pass(path: Float[np.ndarray, "f ..."], fir: Float[np.ndarray, " k"]) -> 
     return correlate1d(path, fir, axis=0, mode="nearest")
 
 
+def bridged(path: Float[np.ndarray, "f ..."], lost: Bool[np.ndarray, " f"]) -> Float[np.ndarray, "f ..."]:
+    """`path` with its `lost` frames on straight lines between the others, constant beyond these; as it is if all are lost."""
+    if lost.all() or not lost.any():
+        return path
+    t, known = np.arange(len(path)), np.flatnonzero(~lost)
+    after = np.clip(np.searchsorted(known, t), 0, len(known) - 1)
+    before = np.maximum(after - (known[after] > t), 0)
+    a, b = known[before], known[after]
+    s = np.clip((t - a) / np.maximum(b - a, 1), 0, 1).reshape(-1, *[1] * (path.ndim - 1))
+    return np.where(lost.reshape(s.shape), (1 - s) * path[a] + s * path[b], path)
+
+
 def roughness(path: Float[np.ndarray, "f ..."], fir: Float[np.ndarray, " k"]) -> float:
-    """The largest distance between a path and its filtered self, ignoring frames that are not finite."""
-    if not path.size:
-        return 0.0
-    off = np.abs(path - low_pass(path, fir))
-    return float(np.nanmax(off)) if np.isfinite(off).any() else 0.0
+    """The largest distance between a path and its filtered self; 0 of one that is not finite."""
+    return float(np.nan_to_num(np.abs(path - low_pass(path, fir))).max(initial=0.0))

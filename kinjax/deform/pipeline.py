@@ -19,7 +19,7 @@ from ..errors import OptionError, ShapeError
 from ..motion import Motion
 from ..quaternions import from_turns, turns
 from .constraints import Goal
-from .filtering import low_pass, roughness, taps
+from .filtering import bridged, low_pass, roughness, taps
 from .plan import Plan, make_plan
 from .reporting import make_report, residual_table
 from .results import Deformation
@@ -175,19 +175,24 @@ def output_motion(motion: Motion, plan: Plan, solved: Any) -> Motion:
 
 
 def smoothed(plan: Plan, solved: Any, settings: Settings, rate: float) -> Any:
-    """The frames of the next pass, which start at the filtered poses and are drawn to them; None when nothing is rough."""
+    """The frames of the next pass, which start at the filtered poses and are drawn to them; None when nothing is rough.
+
+    Frames that could not be solved are the input's: for the filter their displacement is that between their neighbours, and they
+    stay the input's.
+    """
     frames = plan.frames
     root, turned = frames.root, frames.rotations
+    lost = ~(solved.sound & np.isfinite(root).all(1) & np.isfinite(turned).all((1, 2)))
     rough = held = False
     if settings.filter_root is not None:
         fir = taps(settings.filter_root, settings.filter_width, rate)
-        moved = solved.root - frames.root
+        moved = bridged(solved.root - frames.root, lost)
         if roughness(moved, fir) > settings.rough:
             root, rough, held = frames.root + low_pass(moved, fir), True, True
     if settings.filter_joints is not None:
         fir = taps(settings.filter_joints, settings.filter_width, rate)
         r0, r1 = (turns(np.moveaxis(q, 1, 2)) for q in (frames.rotations, solved.rotations))
-        v = (r1 * r0.inv()).as_rotvec().reshape(len(root), -1, 3)
+        v = bridged((r1 * r0.inv()).as_rotvec().reshape(len(root), -1, 3), lost)
         if roughness(v, fir) > settings.rough:
             q = from_turns(Rotation.from_rotvec(low_pass(v, fir).reshape(-1, 3)) * r0)
             turned, rough = np.moveaxis(q.reshape(len(root), -1, 4), 2, 1), True
@@ -197,6 +202,8 @@ def smoothed(plan: Plan, solved: Any, settings: Settings, rate: float) -> Any:
         turned = solved.rotations.astype(float)  # the root is filtered alone: joints go on from where they are
     if not held:
         root = solved.root.astype(float)
+    root = np.where(lost[:, None], frames.root, root)
+    turned = np.where(lost[:, None, None], frames.rotations, turned)
     free = np.zeros_like(frames.warm) if held else np.ones_like(frames.warm)
     goals = frames.goals._replace(root_free=free)
     return frames._replace(rotations=turned, root=root, warm=np.zeros_like(frames.warm), goals=goals)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import OptionError, ShapeError
 from ..quaternions import from_turns, turns
 from .constraints import Goal, LookAt, Orientation, Position, Through
+from .filtering import bridged
 from .shape import Pass, orientation_curve, shape_curve
 
 EASE = 0.3
@@ -184,8 +185,7 @@ def _known(own: np.ndarray, other: np.ndarray) -> np.ndarray:
     lost = ~np.isfinite(own).all(1)
     if lost.all():
         return np.broadcast_to(other, own.shape)
-    t = np.arange(len(own))
-    return np.stack([np.interp(t, t[~lost], x[~lost]) for x in own.T], axis=1) if lost.any() else own
+    return bridged(own, lost)
 
 
 def turn_path(goal: Orientation, title: str, span: Span, own: np.ndarray, rate: float) -> Path:
