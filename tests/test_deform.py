@@ -22,11 +22,13 @@ from kinjax.deform import (
     redeform,
     solving,
 )
+from kinjax.deform.body import Body
 from kinjax.deform.filtering import bridged, low_pass, roughness, taps
 from kinjax.deform.pipeline import smoothed
 from kinjax.deform.plan import make_plan
 from kinjax.errors import KinjaxError, OptionError, ShapeError, UnknownNameError
 from kinjax.motion import Motion
+from kinjax.skeleton import Skeleton, Topology
 
 FRAMES = 80
 FEET = (Position("LeftFoot", priority=3), Position("RightFoot", priority=3))
@@ -518,3 +520,27 @@ def test_weighted_least_squares_agrees_where_all_can_be_had(motion, reached):
     ]
     assert feet[0] > 5e-3 > 10 * feet[1]
     assert np.nanmax(deform(motion, far).report.residual[:, :2]) < 1e-5
+
+
+def test_mass_in_another_tree_counts_and_is_moved_by_the_input_alone():
+    """A heavy ball beside the figure is part of the centre of mass that is asked for, and flies as it did."""
+    frames, ball = 40, len(NAMES)
+    figure, t = standing(frames, sway=0.1), np.arange(frames) / 60
+    top = Topology((*NAMES, "Ball"), (*FIGURE.topology.parents, -1), translated=(0, ball), up="z")
+    masses = np.r_[np.ones(ball), 8.0]
+    skeleton = Skeleton(np.concatenate([OFFSETS, np.zeros((1, 3))]), np.zeros((0, 3)), top, masses, np.full((ball + 1, 3), 0.02))
+    flight = np.stack([0.5 + t, 0 * t, 1 + np.sin(5 * t)], 1)
+    spin = np.stack([np.cos(3 * t), 0 * t, np.sin(3 * t), 0 * t], 1)
+    both = Motion(
+        np.concatenate([figure.translations, flight[:, None]], 1),
+        np.concatenate([figure.rotations, spin[:, None]], 1),
+        skeleton,
+        60.0,
+    )
+    goal = CenterOfMass(offset=(0.02, 0.0, 0.01), begin=20, recruits=NAMES)
+    done = deform(both, [goal, Position("LeftFoot", priority=2)])
+    assert np.nanmax(done.report.residual) < 1e-4
+    for one, other in ((done.motion.rotations, both.rotations), (done.motion.translations, both.translations)):
+        np.testing.assert_array_equal(one[:, -1], other[:, -1])
+    before, after = (Body(m, np.zeros(3)).center() for m in (both, done.motion))
+    np.testing.assert_allclose((after - before)[20:], np.tile([0.02, 0, 0.01], (20, 1)), atol=1e-4)

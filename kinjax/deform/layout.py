@@ -109,8 +109,9 @@ def laid_out(
         (rotation if a.kind == ORIENTATION else place)[on, i] = a.path.goal[on]
         if a.kind == CENTER_OF_MASS:
             centers[i] = a
-    mass_joint, mass_point, weights = _mass_points(list(centers.values()), new, body)
-    carried = weights[:, None, :] * chain.above[mass_joint].T[None]
+    mass_joint, mass_point, weights = _mass_points(list(centers.values()), new, p, body)
+    moves = np.concatenate([chain.above, np.zeros((1, p))])  # no joint moves what is in the world
+    carried = weights[:, None, :] * moves[mass_joint].T[None]
     tasks = _laid(
         Tasks,
         kind, joint, reference, point, look, scale, layers, recruits, root, above, beside,
@@ -123,10 +124,11 @@ def laid_out(
 
 
 def _mass_points(
-    asked: Sequence[Asked], new: dict[int, int], body: Body
+    asked: Sequence[Asked], new: dict[int, int], world: int, body: Body
 ) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "f m 3"], Float[np.ndarray, "d m"]]:
     """Mass points of the chain: a kept joint carries its own segment's mass and that of every joint below it that is not kept,
-    whose pose it takes from the input. Joints (M,), places (F, M, 3) in their frames, weights (D, M)."""
+    whose pose it takes from the input. What hangs in another root's tree is one more point, on the row `world`. Joints (M,),
+    places (F, M, 3) in their frames, weights (D, M)."""
     f, top = body.frames, body.top
     if not asked:
         return np.zeros(0, np.int32), np.zeros((f, 0, 3)), np.zeros((0, 0))
@@ -137,17 +139,20 @@ def _mass_points(
             holder[j] = holder[parent] if parent >= 0 else -1
     n = len(new)
     support = sorted({j for a in asked for j in a.support})
-    m = _padded(n + len(support), 4)
+    carriers = [j for j, fraction in enumerate(masses.fractions) if fraction > 0]
+    beside = n + len(support)  # the place of the point in the world
+    m = _padded(beside + any(holder[j] < 0 for j in carriers), 4)
     total, moment = np.zeros(m), np.zeros((f, m, 3))
-    for j, (fraction, center) in enumerate(zip(masses.fractions, masses.centers, strict=True)):
-        if fraction > 0 and holder[j] >= 0:
-            to_holder = body.relative(holder[j])
-            total[new[holder[j]]] += fraction
-            moment[:, new[holder[j]]] += fraction * to_holder(body.point(j, center))
+    for j in carriers:
+        fraction, at = masses.fractions[j], beside if holder[j] < 0 else new[holder[j]]
+        total[at] += fraction
+        moment[:, at] += fraction * body.relative(holder[j])(body.point(j, masses.centers[j]))
     place = np.where(total[None, :, None] > 0, moment / np.where(total > 0, total, 1)[None, :, None], 0.0)
     joint = np.zeros(m, np.int32)
     joint[:n] = np.arange(n)
-    joint[n : n + len(support)] = [new[j] for j in support]
+    joint[n:beside] = [new[j] for j in support]
+    if total[beside:].any():
+        joint[beside] = world
     weights = np.tile(total, (len(asked), 1))
     for d, a in enumerate(asked):
         for j in a.support:

@@ -43,7 +43,7 @@ class Tasks(NamedTuple):
     joint's frame. look: unit vector in the joint's frame that a look-at turns to its target. scale: (B, 3) axes mask times
     the root of the weight. layer: (B,). recruits: (B, P) and root_recruited (B,): 1 where a joint may be used. above: (B, P)
     joints that move the point; beside: those that move its reference. centers: (D,) which constraints are on a centre of mass;
-    mass_joint: (M,) the joints that carry the mass points; weights (D, M): theirs; carried (D, P, M): the same, of the points
+    mass_joint: (M,) the rows of the world array that carry the mass points; weights (D, M): theirs; carried (D, P, M): the same, of the points
     that joint P moves.
     """
 
@@ -219,7 +219,8 @@ def _levers(
         carried = carried - jnp.sum(tasks.carried, axis=-1)[:, :, None] * p[None]
         beside = tasks.beside[tasks.centers][:, :, None] * (x[tasks.centers][:, None, :] - p[None])
         arm = arm.at[tasks.centers].set(carried - beside)
-        rootward = rootward.at[tasks.centers].multiply(jnp.sum(tasks.weights, axis=1))
+        # the root moves what its turn moves
+        rootward = rootward.at[tasks.centers].multiply(jnp.sum(tasks.carried[:, 0], axis=1))
     return arm, moves, rootward
 
 
