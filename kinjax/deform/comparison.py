@@ -18,14 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..motion import Motion
-from .chain import Pose, compose, forward, inverse_of, moved, parent_rotations
+from .chain import Pose, forward, moved, parent_rotations
 from .constraints import Goal
 from .frame_solver import Reference, attraction
 from .pipeline import output_motion
 from .plan import make_plan
 from .reporting import make_report
 from .results import Deformation
-from .sequence import Solved
+from .sequence import Solved, displaced
 from .settings import Settings
 from .solving import PIECE, _begin, _cast, _piece
 from .tasks import Kinds, look, residuals
@@ -42,12 +42,7 @@ def _run(chain: Any, tasks: Any, frames: Any, first: Any, weight: Any, pull: Any
         last, before = carried
         own = Pose(x.rotations[..., None], x.root[:, None])
         held = x.controlled[None, :, None] > 0
-        start = Pose(
-            jnp.where(
-                held, compose(last.rotations, compose(inverse_of(before.rotations), own.rotations)), own.rotations
-            ),
-            jnp.where(x.root_controlled > 0, last.root + (own.root - before.root), own.root),
-        )
+        start = displaced(own, last, before, x.controlled, x.root_controlled)
         parent = parent_rotations(chain, forward(chain, start, x.offsets))
         reference = Reference(x.rotations, x.root, x.controlled, x.root_controlled)
         free = jnp.concatenate([jnp.full(3, x.root_controlled), jnp.repeat(x.controlled, 3)])

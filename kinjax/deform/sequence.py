@@ -60,6 +60,16 @@ class Carried(NamedTuple):
     pull: Float[Array, ""]
 
 
+def displaced(own: Pose, last: Pose, before: Pose, joints: Float[Array, " p"], root: Float[Array, ""]) -> Pose:
+    """Where a frame starts: its input `own` moved by the last displacement, that of the output `last` from its input `before`, in
+    the joints and, for the root's place, where the marks are above 0."""
+    turn = compose(last.rotations, compose(inverse_of(before.rotations), own.rotations))
+    return Pose(
+        jnp.where(joints[None, :, None] > 0, turn, own.rotations),
+        jnp.where(root > 0, last.root + (own.root - before.root), own.root),
+    )
+
+
 def solve_sequence(
     chain: Chain,
     tasks: Tasks,
@@ -79,14 +89,7 @@ def solve_sequence(
     def step(carried: Carried, x: Frames) -> tuple[Carried, Solved]:
         last, before, trust, pull = carried
         own = Pose(x.rotations[..., None], x.root[:, None])
-        # the last displacement, on the new input
-        turn = compose(last.rotations, compose(inverse_of(before.rotations), own.rotations))
-        start = Pose(
-            jnp.where((x.controlled * x.warm)[None, :, None] > 0, turn, own.rotations),
-            jnp.where(
-                x.root_controlled * x.warm * x.goals.root_free > 0, last.root + (own.root - before.root), own.root
-            ),
-        )
+        start = displaced(own, last, before, x.controlled * x.warm, x.root_controlled * x.warm * x.goals.root_free)
         reference = Reference(
             x.rotations,
             x.root,

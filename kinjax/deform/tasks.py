@@ -43,8 +43,8 @@ class Tasks(NamedTuple):
     joint's frame. look: unit vector in the joint's frame that a look-at turns to its target. scale: (B, 3) axes mask times
     the root of the weight. layer: (B,). recruits: (B, P) and root_recruited (B,): 1 where a joint may be used. above: (B, P)
     joints that move the point; beside: those that move its reference. centers: (D,) which constraints are on a centre of mass;
-    mass_joint: (M,) the rows of the world array that carry the mass points; weights (D, M): theirs; carried (D, P, M): the same, of the points
-    that joint P moves.
+    mass_joint: (M,) the rows of the world array that carry the mass points; weights (D, M): theirs; carried (D, P, M): the same,
+    of the points that joint P moves.
     """
 
     kind: Int[Array, " b"]
