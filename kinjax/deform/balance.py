@@ -47,16 +47,6 @@ def balance_offsets(
     return offsets + displacement_path(displacement, len(center), rate, interpolation)
 
 
-def balance_targets(
-    offsets: Float[np.ndarray, "frames 3"], support: Float[np.ndarray, "frames *points 3"]
-) -> Float[np.ndarray, "frames 3"]:
-    """`P'` (F, 3), world metres: what `balance_offsets` gives, over the output's support (F, A, 3) or its barycentre (F, 3)."""
-    offsets, base = _path(offsets, "offsets"), barycentre(support)
-    if len(base) != len(offsets):
-        raise ShapeError(f"support has {len(base)} frames, offsets have {len(offsets)}")
-    return offsets + base
-
-
 def barycentre(support: Float[np.ndarray, "frames *points 3"]) -> Float[np.ndarray, "frames 3"]:
     """Mean of the supporting points (F, A, 3) in each frame; (F, 3) is one already."""
     points = np.asarray(support, float)
