@@ -238,7 +238,7 @@ def test_numbers_that_no_file_holds_are_refused():
 
 def test_the_documented_example_is_an_edit():
     """docs/edit-files.md and README.md: their TOML is read, and every key is documented."""
-    from kinjax.formats import edits
+    from kinjax.formats.edit_values import KINDS
 
     top = Path(__file__).parents[1]
     for name in ("docs/edit-files.md", "README.md"):
@@ -247,5 +247,5 @@ def test_the_documented_example_is_an_edit():
         for block in blocks:
             assert parse_edit(block).constraints(120)
     text = (top / "docs/edit-files.md").read_text(encoding="utf-8")
-    keys = {k for _, readers in edits._KINDS.values() for k in readers} | {f.name for f in dataclasses.fields(Settings)}
+    keys = {k for _, readers in KINDS.values() for k in readers} | {f.name for f in dataclasses.fields(Settings)}
     assert [k for k in sorted(keys) if f"`{k}`" not in text] == []
