@@ -14,27 +14,33 @@ FAST_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshol
 
 
 def use_cache() -> Path | None:
-    """Keep compiled programs in the user's cache directory; gives the directory, or None where there is none."""
+    """Keep compiled programs in `cache_folder()`; gives the directory, or None where there is none."""
     import jax
+
+    told = jax.config.values["jax_compilation_cache_dir"]
+    if told and not os.environ.get("KINJAX_CACHE", ""):
+        return Path(told)
+    folder = cache_folder()
+    if folder is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    return folder
+
+
+def cache_folder() -> Path | None:
+    """The user's directory of compiled programs, made if need be; None where it is switched off or cannot be written."""
     import platformdirs
 
     named = os.environ.get("KINJAX_CACHE", "")
     if named.lower() in OFF:
         return None
-    told = jax.config.values["jax_compilation_cache_dir"]
-    if told and not named:
-        return Path(told)
     folder = Path(named) if named else Path(platformdirs.user_cache_dir("kinjax"))
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
         return None
-    if not os.access(folder, os.W_OK):
-        return None
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    return folder
+    return folder if os.access(folder, os.W_OK) else None
 
 
 def use_fast_loops() -> None:

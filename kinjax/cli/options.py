@@ -12,6 +12,9 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg, subcommand
 
+from .database_options import NAMES as DATABASE_NAMES
+from .database_options import DatabaseCommand
+
 Kind = Literal["space", "line", "point"]
 
 
@@ -113,6 +116,8 @@ class Plot(Reading, Detecting):
     """A motion file, or annotations (.json, .csv, .parquet, .npz)."""
     output: Annotated[Path, _opt("-o", metavar="DIR", default="kinjax-out")] = Path("kinjax-out")
     """Directory of the pictures."""
+    frames: Annotated[str | None, _opt(metavar="BEGIN:END", default="all")] = None
+    """Draw only these frames of a clip, 0-based, both included; its constraints are those of the whole clip."""
     quiet: Annotated[bool, _opt("-q")] = False
     """Print only warnings and errors."""
 
@@ -253,5 +258,6 @@ Command = (
     | Annotated[Export, subcommand("export")]
     | Annotated[Samples, subcommand("samples")]
     | Annotated[Demo, subcommand("demo")]
+    | DatabaseCommand
 )
-NAMES = ("detect", "deform", "clean", "info", "plot", "report", "export", "samples", "demo")
+NAMES = ("detect", "deform", "clean", "info", "plot", "report", "export", *DATABASE_NAMES, "samples", "demo")

@@ -31,6 +31,7 @@ def plot_command(options: Plot) -> int:
     source, screen = check_file(options.source, "file"), Screen(options.quiet)
     if options.output.exists() and not options.output.is_dir():
         raise OptionError(f"{options.output} is a file, and a directory is needed")
+    span = _span(options.frames)
     with screen.busy() as busy:
         kept = annotations_in(source)
         if kept is not None:
@@ -45,7 +46,7 @@ def plot_command(options: Plot) -> int:
             busy.step(f"detecting in {source.name}")
             clip = load_clip(source, options)
             found, note = detect_in(clip, options, source.name)
-            figures = clip_figures(found, clip)
+            figures = clip_figures(found, clip, span)
             lines = [f"{source.name}: {summary(found.annotations())}", *([note] if note else [])]
             for warning in found.warnings:
                 screen.warn(warning)
@@ -74,12 +75,36 @@ def annotations_in(path: Path) -> Annotations | None:
         raise
 
 
-def clip_figures(found: Detection, clip: Clip) -> Iterator[tuple[str, Figure]]:
-    """The pictures of one detection with the names of their files: times, scene, and by object the noise patterns."""
+def _span(text: str | None) -> tuple[int, int] | None:
+    """First and last frame of `BEGIN:END`."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"\s*(\d+):(\d+)\s*", text)
+    if match is None or int(match[1]) > int(match[2]):
+        raise OptionError(f"--frames {text!r}: write BEGIN:END, frame numbers from 0")
+    return int(match[1]), int(match[2])
+
+
+def clip_figures(
+    found: Detection, clip: Clip, span: tuple[int, int] | None = None
+) -> Iterator[tuple[str, Figure]]:
+    """The pictures of one detection with the names of their files: times, scene, and by object the noise patterns.
+
+    span: first and last frame that are shown; the rest of the clip has no part in times and scene.
+    """
     from .. import plots
 
-    yield "timeline", plots.timeline(found)
-    yield "scene", plots.skeleton_3d(clip, found) if isinstance(clip, Motion) else plots.objects_3d(clip, found)
+    times, shown = plots.timeline(found), None
+    if span is not None:
+        begin, end = span
+        if end >= found.frames:
+            raise OptionError(f"--frames {begin}:{end} is outside the clip, whose frames are 0..{found.frames - 1}")
+        room = max(1, (end - begin) // 10)
+        times.axes[0].set_xlim((begin - room) / float(found.rate), (end + room) / float(found.rate))
+        shown = sorted({begin, (begin + end) // 2, end})
+    yield "timeline", times
+    draw = plots.skeleton_3d if isinstance(clip, Motion) else plots.objects_3d
+    yield "scene", draw(clip, found, shown)  # type: ignore[operator]
     for name in found.objects:
         for kind in sorted(found.sigma_max):
             part = re.sub(r"[^\w.-]+", "_", name)

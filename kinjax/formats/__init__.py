@@ -1,5 +1,5 @@
-"""The file formats: motion comes in and goes out as BVH and npz; annotations as JSON, CSV, Parquet, npz and exports;
-the constraints of a deformation as edit files.
+"""The file formats: motion comes in as BVH, ASF/AMC, C3D (marker clusters) and npz, and goes out as BVH and npz;
+annotations as JSON, CSV, Parquet, npz and exports; the constraints of a deformation as edit files.
 
 In: paths. Out: `Motion`, `Poses`, `Annotations` and `Edit`, in metres, seconds and radians: a file's own units, degrees and
 channel orders stop here. A file is read whole or refused (`FileFormatError`: file, line, column, what was found, the
@@ -22,16 +22,18 @@ _ROOMS = {
     "bvh": ("parse_bvh", "read_bvh"),
     "bvh_write": ("write_bvh",),
     "bvh_like": ("write_bvh_like",),
+    "asf_amc": ("read_amc", "read_asf"),
+    "c3d": ("Markers", "read_c3d", "read_c3d_markers", "rigid_objects"),
     "npz": ("read_motion_npz", "read_poses_npz", "write_motion_npz", "write_poses_npz"),
     "annotations_io": ("read_annotations", "write_annotations"),
     "edits": ("Edit", "parse_edit", "read_edit", "write_edit"),
     "exports": ("export",),
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
-_READERS = {".bvh": "read_bvh", ".npz": "read_motion_npz"}
+_READERS = {".bvh": "read_bvh", ".amc": "read_amc", ".c3d": "read_c3d", ".npz": "read_motion_npz"}
 _WRITERS = {".bvh": "write_bvh", ".npz": "write_motion_npz"}
 
-__all__ = ["load", "save", *sorted(_HOME)]
+__all__ = ["load", "motion_suffixes", "save", *sorted(_HOME)]
 
 
 def __getattr__(name: str) -> Any:
@@ -46,10 +48,17 @@ def __dir__() -> list[str]:
     return __all__
 
 
-def load(path: str | Path, **options: Any) -> Motion | Poses:
-    """The motion in a file; the suffix (any case) chooses the reader: .bvh or .npz. An .npz of poses gives `Poses`.
+def motion_suffixes() -> tuple[str, ...]:
+    """The suffixes of the files that `load` reads, in small letters."""
+    return tuple(_READERS)
 
-    `options` go to that reader (`read_bvh`: unit, up). Raises `FileFormatError` for another suffix or a broken file.
+
+def load(path: str | Path, **options: Any) -> Motion | Poses:
+    """The motion in a file; the suffix (any case) chooses the reader: .bvh, .amc, .c3d or .npz.
+
+    A .c3d, and an .npz of poses, give `Poses`.
+
+    `options` go to that reader (`read_bvh`: unit, up, joints). Raises `FileFormatError` for another suffix or a broken file.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in _READERS:
