@@ -17,9 +17,8 @@ import math
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
-import msgspec
 import numpy as np
 
 from ..annotations import Annotations, Constraints
@@ -29,7 +28,7 @@ from ..errors import OptionError, UnknownNameError, find_name
 from ..motion import Motion
 from .cache import use_cache
 from .options import Clean, Deform, Deforming
-from .request import check_file, default_objects, load_clip, request
+from .request import assignments, check_file, default_objects, load_clip, request
 from .show import Busy, Screen, summary
 
 MOTIONS = (".bvh", ".npz")
@@ -110,21 +109,16 @@ def _settings(options: Deforming, base: Settings) -> Settings:
     """The settings of the edit, or of cleaning, with what the options change."""
     changes: dict[str, Any] = {"iterations": options.iterations, "precision": options.precision}
     changes = {k: v for k, v in changes.items() if v is not None}
-    hints = get_type_hints(Settings)
-    for text in options.solver:
-        name, equals, value = text.partition("=")
-        name = name.strip().replace("-", "_")
-        if not equals:
-            raise OptionError(f"--solver {text!r}: write NAME=VALUE")
-        if name not in hints:
-            raise UnknownNameError(name, [f.name for f in fields(Settings)], "setting", "--solver")
-        try:
-            words = {"none": None, "off": None, "true": True, "false": False}
-            plain = words.get(value.strip().lower(), value.strip())
-            changes[name] = msgspec.convert(plain, hints[name], strict=False)
-        except msgspec.ValidationError as error:
-            raise OptionError(f"--solver {text}: {str(error)[:1].lower()}{str(error)[1:]}") from None
-    return replace(base, **changes)
+    return replace(base, **(changes | assignments("--solver", options.solver, Settings, _word, _no_setting)))
+
+
+def _word(name: str, text: str) -> Any:
+    """The value of a setting of the solver: a word for nothing, yes and no, or the text as it is."""
+    return {"none": None, "off": None, "true": True, "false": False}.get(text.strip().lower(), text.strip())
+
+
+def _no_setting(name: str) -> None:
+    raise UnknownNameError(name, [f.name for f in fields(Settings)], "setting", "--solver")
 
 
 def _progress(busy: Busy) -> Callable[[int, int], None]:
