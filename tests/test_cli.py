@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -380,7 +381,14 @@ def test_the_demo_is_what_happens_without_a_command(
     assert "constraints found" in out and "Try next:" in out and "'./my run' detect" in out
     assert "not found" not in out  # every constraint that is true is found
     written = {p.name for p in (tmp_path / "kinjax-out").iterdir()}
-    assert written >= {"walk.bvh", "walk.json", "walk.html", "walk-truth.json", "hinge.npz", "hinge.html"}
+    assert written >= {"walk.bvh", "walk.json", "walk.html", "walk-truth.json", "walk-reach.toml", "hinge.npz", "hinge.html"}
+    advice = [shlex.split(line)[1:] for line in out.split("Try next:")[1].splitlines() if "walk.bvh" in line]
+    assert [a[0] for a in advice] == ["info", "detect", "clean", "deform"]
+    for command in advice:
+        assert all((tmp_path / a).exists() for a in command if a.startswith("kinjax-out"))
+    if clips == "all":  # compiles much
+        assert all(main(command) == 0 for command in advice)
+        assert {"left-foot.csv", "walk-clean.bvh", "walk-reach.bvh"} <= {p.name for p in tmp_path.iterdir()}
 
 
 # ---- how it prints

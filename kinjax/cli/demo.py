@@ -26,6 +26,24 @@ from .show import Screen, table
 
 Pair = tuple[Constraint | None, Constraint | None]
 
+REACH = """# The left hand reaches up by 20 cm for a second; the feet, above it, stay on their paths.
+
+[[position]]
+joint = "LeftFoot"
+priority = 2
+
+[[position]]
+joint = "RightFoot"
+priority = 2
+
+[[position]]
+joint = "LeftHand"
+offset = [0, 0.2, 0]
+begin = "1 s"
+end = "2 s"
+priority = 1
+"""
+
 
 def demo_command(options: Demo) -> int:
     """`kinjax demo`: detect, compare, write."""
@@ -45,6 +63,7 @@ def demo_command(options: Demo) -> int:
             write_scene(folder, scene)
             pairs[name] = pair(found.constraints, truth)
             busy.step("detecting", done + 1)
+    (folder / "walk-reach.toml").write_text(REACH, encoding="utf-8")
     for name, scene in scenes.items():
         screen.print(comparison(name, scene, pairs[name]))
         screen.print()
@@ -127,15 +146,18 @@ def write_scene(folder: Path, scene: Scene) -> Iterator[Path]:
 def farewell(folder: Path) -> Iterator[str]:
     """Where everything is, and what to try next."""
     kinjax = shlex.quote(os.environ.get("KINJAX_PROG") or "kinjax")
-    walk = shlex.quote(str(folder / "walk.bvh"))
+    walk, found, edit = (shlex.quote(str(folder / f"walk{end}")) for end in (".bvh", ".json", "-reach.toml"))
     yield ""
     yield f"Written to {folder}{os.sep}:"
     yield "  *.html        reports with pictures, made to be opened in a browser"
     yield "  *.json        annotations; *-truth.json is what is true by construction"
     yield "  *.bvh, *.npz  the clips"
+    yield "  *.toml        an edit: constraints to bend a clip to"
     yield "Try next:"
     yield f"  {kinjax} info {walk}"
     yield f"  {kinjax} detect {walk} --object LeftFoot --template 0:120 -o left-foot.csv"
+    yield f"  {kinjax} clean {walk} --annotations {found} -o walk-clean.bvh"
+    yield f"  {kinjax} deform {walk} {edit} -o walk-reach.bvh"
     yield f"  {kinjax} detect your-own.bvh --report your-own.html"
     yield f"  {kinjax} --help"
 
