@@ -10,6 +10,10 @@ import pytest
 from benchmarks import forceplates as fp
 from benchmarks.forceplates import table
 from benchmarks.forceplates.__main__ import main
+from kinjax.evaluation import evaluate
+from kinjax.evaluation.rules import RULES
+from kinjax.evaluation.spans import runs
+from kinjax.formats.labels import read_labels
 from kinjax.kinematics import cluster_poses
 
 ROBUST = ("robust, template", "robust, no template")
@@ -182,6 +186,81 @@ def test_the_report_names_what_it_holds():
     assert any("L 50:150" in line and "10 frames wrong" in line for line in fp.misses(results))
 
 
+def evaluation_of(trials, labels_by_trial):
+    """`kinjax.evaluation` of the same labels: one clip a trial, the stances as bounds of their foot, the others unknown."""
+    rows = {k: [] for k in ("clip", "object", "type", "begin", "end")}
+    for trial, labels in zip(trials, labels_by_trial, strict=True):
+        spans = {(s.foot, span) for s, y in zip(trial.stances, labels, strict=True) for span in y.spans}
+        for foot, (begin, end) in sorted(spans):
+            for key, value in zip(rows, (trial.name, foot, "space", begin, end), strict=True):
+                rows[key].append(value)
+    clips = {"clip": [t.name for t in trials], "frames": [t.frames for t in trials], "fps": [t.rate for t in trials]}
+    return evaluate(rows, fp.stance_labels(trials, {"L": "L", "R": "R"}, suffix=""), clips)
+
+
+def assert_same_figures(trials, labels_by_trial):
+    scores = [
+        fp.score(y.frames, y.spans, s, t.contact(s.foot), t.rate)
+        for t, labels in zip(trials, labels_by_trial, strict=True)
+        for s, y in zip(t.stances, labels, strict=True)
+    ]
+    t, e = fp.total(scores), evaluation_of(trials, labels_by_trial).total
+    ours = (e.precision, e.recall, e.whole_recall, e.begin.median, e.end.median, e.labels)
+    assert ours == pytest.approx((t.precision, t.core, t.recall, t.strike, t.off, t.stances), nan_ok=True)
+    assert e.found == sum(s.labelled for s in scores) and e.right == sum(s.right for s in scores)
+
+
+def test_evaluation_gives_the_same_figures():
+    """Made stances and labels: of both feet, some cut, some labels far away, some in contacts that are left out."""
+    rng = np.random.default_rng(0)
+    stances = (fp.Stance("L", 30, 90), fp.Stance("R", 80, 140), fp.Stance("L", 120, 181))
+    trial = fp.Trial("made", RATE, {"L": foot(), "R": foot()}, stances, (fp.Stance("R", 0, 25), fp.Stance("L", 195, 200)))
+    for _ in range(20):
+        by_foot = {}
+        for name in ("L", "R"):
+            mask = np.repeat(rng.random(20) < 0.6, 10)
+            by_foot[name] = fp.Label(mask, tuple(map(tuple, runs(mask).tolist())))
+        assert_same_figures([trial], [[by_foot[s.foot] for s in stances]])
+
+
+def test_evaluation_gives_the_same_figures_on_recorded_trials(trials):
+    few = [t for t in trials if t.name != "PiG_Motion3_FF"]
+    for method in ("toe displacement", "toe under 0.15 m/s"):
+        for condition in ("clean", "10 % lost"):
+            markers = [fp.disturbed(t.markers, t.rate, condition, t.name) for t in few]
+            assert_same_figures(few, [fp.labels_of(method, t, m) for t, m in zip(few, markers, strict=True)])
+
+
+# comparison -----------------------------------------------------------------------------------------------------------
+
+
+def test_stances_as_labels():
+    trial = fp.Trial("made", RATE, {"L": foot()}, (fp.Stance("L", 50, 150),), (fp.Stance("L", 180, 200),))
+    first, second = fp.stance_labels([trial])
+    assert (first.clip, first.object, first.begin, first.end, first.kind) == ("made.c3d", "left_foot", 50, 149, "outer")
+    assert (second.begin, second.end, second.kind, second.type) == (180, 199, "unknown", "")
+
+
+def test_rules_are_compared_stance_by_stance():
+    trial = fp.Trial("made", RATE, {"L": foot((20, 80), (120, 180))}, (fp.Stance("L", 20, 80), fp.Stance("L", 120, 180)), ())
+    told = []
+    results = fp.compare([trial], ("toe displacement", "toe speed"), ("clean", "3 mm white"), seeds=2, progress=told.append)
+    assert len(results) == 4 and told == ["made: 2 stances"]
+    t = results["toe displacement", "clean"].total
+    assert (t.precision, t.recall, t.labels) == (1, 1, 4) and abs(t.begin.median) <= 10 and abs(t.end.median) <= 10
+    assert results["toe speed", "3 mm white"].total.recall < 0.1
+    text = fp.comparison(results)
+    assert "toe speed" in text and "3 mm white" in text and fp.comparison(results, markdown=True).startswith("| method")
+
+
+@pytest.mark.slow
+def test_robust_keeps_its_recall_where_rules_lose_theirs(trials):
+    found = fp.compare(trials, ("space, no template", *RULES), ("clean", "1 mm white"))
+    assert all(found[m, "clean"].total.recall > 0.95 for m, c in found)
+    for name in RULES:
+        assert found[name, "1 mm white"].total.recall < 0.5 < 0.98 < found["space, no template", "1 mm white"].total.recall
+
+
 # conditions -----------------------------------------------------------------------------------------------------------
 
 
@@ -308,6 +387,13 @@ def test_the_command_prints_the_table(trials, data, capsys, monkeypatch):
     assert main(["--data", str(data), "--each"]) == 0
     out, progress = capsys.readouterr()
     assert "16 stances of 5 walking trials" in out and "robust, no template" in out and len(progress.splitlines()) == 5
+
+
+def test_the_command_writes_labels(trials, data, tmp_path, capsys):
+    path = tmp_path / "stances.json"
+    assert main(["--data", str(data), "--labels", str(path)]) == 0
+    labels = read_labels(path)
+    assert labels == fp.stance_labels(trials) and sum(x.kind == "outer" for x in labels) == 16
 
 
 def test_the_command_says_where_it_looked(tmp_path, capsys):

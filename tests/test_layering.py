@@ -14,8 +14,9 @@ HEAVY = ("jax", "jaxlib", "numpy", "scipy", "matplotlib", "pyarrow", "duckdb", "
 
 # From the foundations to what touches disk, argv and browsers. A name is a module, or a folder and all in it.
 ORDER = (
-    "errors", "marker_sets", "numerics", "rotations", "quaternions", "splines", "annotations", "skeleton", "joint_names", "anthropometry", "motion", "kinematics",
-    "synthetic", "detect", "deform", "soft", "formats", "database", "plots", "report", "studio", "cli",
+    "errors", "marker_sets", "numerics", "rotations", "quaternions", "splines", "annotations", "skeleton",
+    "joint_names", "anthropometry", "motion", "kinematics",
+    "synthetic", "detect", "deform", "soft", "evaluation", "formats", "database", "plots", "report", "studio", "cli",
 )  # fmt: skip
 # Inside detect/, deform/ and cli/, the same; in detect/ a file that is not named here gathers the others.
 DETECT = (
@@ -29,8 +30,8 @@ DEFORM = (
 )  # fmt: skip
 STRANGERS = ({"detect", "deform"}, {"studio", "cli"}, {"plots", "database"})
 CLI = (
-    "cache", "database_options", "options", "parse", "show", "request", "detecting", "deforming", "pictures", "annotating",
-    "querying", "commands", "demo",
+    "cache", "database_options", "evaluating_options", "options", "parse", "show", "request", "detecting", "deforming",
+    "pictures", "annotating", "querying", "evaluating", "commands", "demo",
 )  # fmt: skip
 
 FILES = sorted(PACKAGE.rglob("*.py"))

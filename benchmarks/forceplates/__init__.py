@@ -1,16 +1,19 @@
 """Detection against force plates: the stances of walking trials, what is done to their markers, how labels are scored.
 
-trials -> conditions -> methods -> scoring -> table. `python -m benchmarks.forceplates --data DIR` prints the table; the
-tests use the same functions. A foot is the rigid cluster of its heel, toe and ankle markers.
+trials -> conditions -> methods -> scoring -> table, and comparison with the rules of thumb. `python -m benchmarks.forceplates
+--data DIR` prints the table, with `--rules` the comparison; the tests use the same functions. A foot is the rigid cluster of
+its heel, toe and ankle markers.
 """
 
+from .comparison import compare, comparison, stance_labels
 from .conditions import CONDITIONS, disturbed
-from .methods import METHODS, PIVOTS, Label, labels_of, template_stance
+from .methods import COMPARED, METHODS, PIVOTS, Label, labels_of, template_stance
 from .scoring import Score, Total, flat_frames, score, total
 from .table import evaluate, misses, report, totals
 from .trials import FEET, MARKERS, Stance, Trial, load_trial, load_trials, poses_of, stances
 
 __all__ = [
+    "COMPARED",
     "CONDITIONS",
     "FEET",
     "MARKERS",
@@ -21,6 +24,8 @@ __all__ = [
     "Stance",
     "Total",
     "Trial",
+    "compare",
+    "comparison",
     "disturbed",
     "evaluate",
     "flat_frames",
@@ -31,6 +36,7 @@ __all__ = [
     "poses_of",
     "report",
     "score",
+    "stance_labels",
     "stances",
     "template_stance",
     "total",

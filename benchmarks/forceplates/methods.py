@@ -14,6 +14,8 @@ import numpy as np
 
 from kinjax.annotations import Template
 from kinjax.detect import Detection, calibrate, detect
+from kinjax.evaluation.rules import RULES, Rule, toe_speed
+from kinjax.evaluation.spans import runs
 from kinjax.motion import Poses
 
 from .trials import MARKERS, Stance, Trial, poses_of
@@ -67,21 +69,22 @@ def with_template(**settings: Any) -> Method:
     return run
 
 
-def toe_rule(limit: float = 0.15, width: int = 6) -> Method:
-    """A peer: the toe marker slower than `limit` m/s from frame to frame, then a median filter over `width` frames."""
+def rule(plants: Rule, marker: str = "TOE") -> Method:
+    """A peer: a rule of thumb (`kinjax.evaluation.rules`) on the path of one marker of the foot."""
 
     def run(trial: Trial, markers: Mapping[str, np.ndarray]) -> list[Label]:
-        from scipy.ndimage import median_filter
-
         out = {}
         for foot, x in markers.items():
-            toe = x[:, MARKERS.index("TOE")]
-            speed = np.linalg.norm(np.diff(toe, axis=0, append=np.nan), axis=-1) * trial.rate
-            with np.errstate(invalid="ignore"):
-                out[foot] = _runs(median_filter((speed < limit).astype(np.uint8), size=width, mode="nearest") > 0)
+            planted = plants(x[:, MARKERS.index(marker)], trial.rate)
+            out[foot] = Label(planted, tuple((int(b), int(e)) for b, e in runs(planted)))
         return [out[s.foot] for s in trial.stances]
 
     return run
+
+
+def toe_rule(limit: float = 0.15, width: int = 6) -> Method:
+    """A peer: the toe marker slower than `limit` m/s from frame to frame, then a median filter over `width` frames."""
+    return rule(lambda path, rate: toe_speed(path, rate, limit, width / rate))
 
 
 METHODS: dict[str, Method] = {
@@ -97,14 +100,25 @@ PIVOTS: dict[str, Method] = {"robust, space and pivots": automatic(method="robus
 """Space with the pivots that touch it: compared with the whole stance."""
 
 
+ALL = ("space", "line", "point")
+COMPARED: dict[str, Method] = {
+    "space, no template": METHODS["robust, no template"],
+    "space, one template": METHODS["robust, template"],
+    "space and pivots, no template": PIVOTS["robust, space and pivots"],
+    "space and pivots, one template": with_template(method="robust", types=ALL),
+    **{name: rule(plants) for name, plants in RULES.items()},
+}
+"""The rows of the comparison with the rules of thumb."""
+
+
 def _detect_like(poses: Poses, shown: Stance, foot: str, settings: Mapping[str, Any]) -> Detection:
     """Detection with a template on the core of `shown`; for the other foot with the pattern that it gives."""
     begin, end = shown.core
     template = [Template(shown.foot, begin, end - 1)]
     if shown.foot == foot:
         return detect(poses, templates=template, **settings)
-    (pattern,) = calibrate(poses, template, **settings)
-    return detect(poses, patterns=[pattern.with_object(foot)], **settings)
+    patterns = [p.with_object(foot) for p in calibrate(poses, template, **settings) if p.object == shown.foot]
+    return detect(poses, patterns=patterns, **settings)
 
 
 def _label(found: Detection, foot: str) -> Label:
@@ -115,12 +129,6 @@ def _label(found: Detection, foot: str) -> Label:
     return Label(frames, spans)
 
 
-def _runs(frames: np.ndarray) -> Label:
-    """Consecutive frames as constraints."""
-    edge = np.flatnonzero(np.diff(np.concatenate([[False], frames, [False]]).astype(int)))
-    return Label(frames, tuple((int(b), int(e) - 1) for b, e in edge.reshape(-1, 2)))
-
-
 def labels_of(method: Method | str, trial: Trial, markers: Mapping[str, np.ndarray]) -> list[Label]:
-    """The labels of a method, or of one of `METHODS` or `PIVOTS` by its name."""
-    return ({**METHODS, **PIVOTS}[method] if isinstance(method, str) else method)(trial, markers)
+    """The labels of a method, or of one of `METHODS`, `PIVOTS` or `COMPARED` by its name."""
+    return ({**METHODS, **PIVOTS, **COMPARED}[method] if isinstance(method, str) else method)(trial, markers)

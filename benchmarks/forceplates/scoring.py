@@ -1,6 +1,7 @@
 """How labels are counted against a stance.
 
-In: the labelled frames of one foot, and one stance of it. Out: `Score`, counts of that stance; `total` pools stances.
+In: the labelled frames of one foot, and one stance of it. Out: `Score`, counts of that stance; `total` pools stances. Frames
+are counted by `kinjax.evaluation`.
 
 Contact is unknown elsewhere on the floor, so precision counts only labels within 0.25 s of the stance, and none
 in a contact that was left out. Core recall is that of the middle 25 to 55 % of the stance. The constraints' begin and
@@ -10,14 +11,15 @@ end are held against the frames in which every marker of the foot moves under 0.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
-from .trials import Stance, speeds
+from kinjax.evaluation.counting import REACH as AROUND
+from kinjax.evaluation.counting import against_bounds, errors
 
-AROUND = 0.25
-"""Seconds around a stance in which precision is counted."""
+from .trials import CORE, Stance, speeds
+
 STILL = 0.15
 """m/s: a foot is flat while every marker of it is slower."""
 
@@ -71,22 +73,13 @@ def score(
     labelled: frames under a constraint (bool). spans: the constraints, first and last frame. contact: by frame, 1 in a
     stance that counts, -1 in one that does not (see `Trial.contact`). flat: first and last frame of the flat foot.
     """
-    around = round(AROUND * rate)
-    near = np.zeros(len(labelled), bool)
-    near[max(0, stance.begin - around) : stance.end + around] = True
-    near &= contact >= 0
-    core = labelled[slice(*stance.core)]
-    whole = labelled[stance.begin : stance.end]
-    own = [s for s in spans if s[0] < stance.end and s[1] >= stance.begin]
-    errors = (np.nan,) * 4
-    if own:
-        first, last = min(b for b, _ in own), max(e for _, e in own)
-        against_flat = (np.nan, np.nan) if flat is None else (first - flat[0], last - flat[1])
-        errors = tuple(x / rate for x in (*against_flat, first - stance.begin, last - (stance.end - 1)))
-    return Score(
-        int((labelled & near).sum()), int((labelled & near & (contact > 0)).sum()),
-        len(core), int(core.sum()), len(whole), int(whole.sum()), *errors,
-    )
+    first, last = stance.begin, stance.end - 1
+    counts = against_bounds(labelled, first, last, contact, rate, CORE, AROUND)
+    late = errors(np.array(spans, int).reshape(-1, 2), first, last, rate)
+    flat_late = (np.nan, np.nan)
+    if late and flat:  # both are off by what the flat foot and the stance differ
+        flat_late = late[0] - (flat[0] - first) / rate, late[1] - (flat[1] - last) / rate
+    return Score(*astuple(counts), *flat_late, *(late or (np.nan, np.nan)))
 
 
 def flat_frames(markers: np.ndarray, stance: Stance, rate: float) -> tuple[int, int] | None:

@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 
+from kinjax.evaluation.counting import CORE
+from kinjax.evaluation.spans import core
 from kinjax.kinematics import cluster_poses
 from kinjax.motion import Poses
 
 FEET = ("L", "R")
 MARKERS = ("HEE", "TOE", "ANK")
-CORE = (0.25, 0.55)
-"""The part of a stance in which a foot is flat in everyone's walk."""
 SHORTEST = 0.45
 """Seconds; a stance of walking is longer."""
 SEEN = 0.8
@@ -43,8 +43,7 @@ class Stance:
     @property
     def core(self) -> tuple[int, int]:
         """First frame of the core, and the first after it."""
-        length = self.end - self.begin
-        return tuple(self.begin + int(np.ceil(part * length - 1e-9)) for part in CORE)  # type: ignore[return-value]
+        return core(self.begin, self.end - 1, CORE)
 
     def overlaps(self, other: Stance) -> bool:
         """Whether it is the same foot at the same time."""
@@ -142,9 +141,9 @@ def speeds(markers: np.ndarray, rate: float) -> np.ndarray:
     return out
 
 
-def _stillest(markers: Mapping[str, np.ndarray], rate: float, core: tuple[int, int]) -> str | None:
-    """The foot whose markers are slowest in the core, on average; None where neither is seen."""
-    speed = {foot: speeds(x, rate)[slice(*core)] for foot, x in markers.items()}
+def _stillest(markers: Mapping[str, np.ndarray], rate: float, middle: tuple[int, int]) -> str | None:
+    """The foot whose markers are slowest in the middle, on average; None where neither is seen."""
+    speed = {foot: speeds(x, rate)[slice(*middle)] for foot, x in markers.items()}
     speed = {foot: float(np.nanmean(v)) for foot, v in speed.items() if np.isfinite(v).any()}
     return min(speed, key=speed.__getitem__) if speed else None
 
