@@ -37,10 +37,12 @@ _ROOMS = {
         "redeform",
     ),
     "formats": ("load", "save", "read_bvh", "write_bvh", "read_annotations", "write_annotations", "read_edit"),
+    "database": ("Configuration", "Store", "TemplateRule", "When", "annotate"),
+    "evaluation": ("Label", "evaluate"),
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 
-_SUBMODULES = ("deform", "detect", "formats", "kinematics", "plots", "report", "synthetic")
+_SUBMODULES = ("database", "deform", "detect", "evaluation", "formats", "kinematics", "plots", "report", "synthetic")
 
 __all__ = ["__version__", *sorted(_HOME), *_SUBMODULES]
 

@@ -17,8 +17,8 @@ from jaxtyping import Array, Float, Int
 
 from . import quaternions
 from .errors import OptionError, ShapeError, find_name
+from .lengths import bucket
 from .motion import Motion, Poses
-from .numerics import bucket
 from .rotations import multiply, rotate
 
 
@@ -69,7 +69,7 @@ def forward_kinematics(motion: Motion) -> tuple[Float[Array, "frames joints 4"],
     """World rotation (wxyz) and position (metres) of every joint at every frame.
 
     Shapes (frames, joints, 4) and (frames, joints, 3) of a motion without batch axes. Compiles once for each length: pad
-    with `numerics.bucket` where lengths vary.
+    with `lengths.bucket` where lengths vary.
     """
     if motion.rotations.ndim != 3:
         raise ShapeError(f"rotations {motion.rotations.shape}: one clip is (frames, joints, 4); vmap for more")

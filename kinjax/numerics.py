@@ -14,11 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
+from .lengths import BLOCK
+
 Bits = UInt32[Array, "lanes words"]
 """Flags packed 32 to a word."""
-
-BLOCK = 32
-"""Running sums work in blocks of so many; padded lengths are multiples of it (XLA pads slowly)."""
 
 
 def eps_of(x: Float[Array, "..."]) -> float:
@@ -199,13 +198,3 @@ def in_chunks(step: Any, state: Any, rows: int, count: Int[Array, ""]) -> tuple[
 
     needed = jnp.minimum((count + CHUNK - 1) // CHUNK, rows // CHUNK)
     return jax.lax.fori_loop(jnp.zeros_like(needed), needed, chunk, (state, out))
-
-
-def bucket(n: int, smallest: int = 64) -> int:
-    """The next array length from 64, 96, 128, 160, 192, 224, 256, 320, ...: from 128 on four sizes an octave, so at most a
-    fifth of a long clip is padding. All are multiples of `BLOCK`."""
-    size = smallest
-    while size * 2 <= n:
-        size *= 2
-    step = max(BLOCK, size // 4)
-    return size + step * max(0, -(-(n - size) // step))

@@ -13,7 +13,7 @@ import pytest
 from kinjax.cli import main
 from kinjax.errors import OptionError
 
-COMMANDS = ("detect", "deform", "clean", "info", "plot", "report", "export", "samples", "demo")
+COMMANDS = ("detect", "deform", "clean", "info", "plot", "report", "export", "annotate", "query", "evaluate", "store", "samples", "demo")
 
 
 @pytest.fixture(autouse=True)

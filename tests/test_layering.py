@@ -14,7 +14,7 @@ HEAVY = ("jax", "jaxlib", "numpy", "scipy", "matplotlib", "pyarrow", "duckdb", "
 
 # From the foundations to what touches disk, argv and browsers. A name is a module, or a folder and all in it.
 ORDER = (
-    "errors", "marker_sets", "numerics", "rotations", "quaternions", "splines", "annotations", "skeleton",
+    "errors", "marker_sets", "lengths", "numerics", "rotations", "quaternions", "splines", "annotations", "skeleton",
     "joint_names", "anthropometry", "motion", "kinematics",
     "synthetic", "detect", "deform", "soft", "evaluation", "formats", "database", "plots", "report", "studio", "cli",
 )  # fmt: skip
@@ -30,7 +30,7 @@ DEFORM = (
 )  # fmt: skip
 STRANGERS = ({"detect", "deform"}, {"studio", "cli"}, {"plots", "database"})
 CLI = (
-    "cache", "database_options", "evaluating_options", "options", "parse", "show", "request", "detecting", "deforming",
+    "cache", "evaluating_options", "database_options", "options", "parse", "show", "assignments", "request", "detecting", "deforming",
     "pictures", "annotating", "querying", "evaluating", "commands", "demo",
 )  # fmt: skip
 

@@ -11,11 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks import reliability
+from kinjax.lengths import BLOCK, bucket
 from kinjax.numerics import (
-    BLOCK,
     bits_after,
     bits_before,
-    bucket,
     counts_at,
     eps_of,
     order_statistic,

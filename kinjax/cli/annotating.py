@@ -18,9 +18,9 @@ from ..database.configuration import Configuration, TemplateRule, read_configura
 from ..database.engines import NoWorkers, make_engine
 from ..database.job import Progress, Report, annotate
 from ..errors import KinjaxError, OptionError
+from .assignments import changed_settings
 from .cache import cache_folder
 from .database_options import Annotate
-from .request import changed_settings
 from .show import Screen, table
 
 FAILED = 1
@@ -33,7 +33,7 @@ def annotate_command(options: Annotate) -> int:
     if options.output is None:
         raise OptionError("-o STORE says where the annotations go")
     configuration = _configuration(options)
-    engine = make_engine(options.engine, options.workers, options.scheduler, options.threads)
+    engine = make_engine(options.engine, options.workers, options.scheduler, options.threads, options.patience)
     screen = Screen(options.quiet)
     began = time.monotonic()
     try:

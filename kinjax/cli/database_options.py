@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg, subcommand
 
+from .evaluating_options import Evaluate
+
 Kind = Literal["space", "line", "point"]
 
 
@@ -61,6 +63,8 @@ class Annotate:
     """A Dask scheduler that runs already, as tcp://host:8786; its workers must see the same folders."""
     threads: Annotated[int, _opt(metavar="N", default="1")] = 1
     """Threads of XLA in each worker."""
+    patience: Annotated[float, _opt(metavar="SECONDS", default="60")] = 60.0
+    """How long to wait without any Dask worker before the job fails."""
     timeout: Annotated[float, _opt(metavar="SECONDS", default="300")] = 300.0
     """How long one file may take (--engine dask)."""
     attempts: Annotated[int, _opt(metavar="N", default="3")] = 3
@@ -129,6 +133,7 @@ class StoreCommand:
 DatabaseCommand = (
     Annotated[Annotate, subcommand("annotate")]
     | Annotated[Query, subcommand("query")]
+    | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[StoreCommand, subcommand("store")]
 )
-NAMES = ("annotate", "query", "store")
+NAMES = ("annotate", "query", "evaluate", "store")

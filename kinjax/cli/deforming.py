@@ -26,9 +26,10 @@ from ..deform import STATUSES, Deformation, Settings, constraints_from, deform
 from ..detect import detect
 from ..errors import OptionError, UnknownNameError, find_name
 from ..motion import Motion
+from .assignments import assignments
 from .cache import use_cache
 from .options import Clean, Deform, Deforming
-from .request import assignments, check_file, default_objects, load_clip, request
+from .request import check_file, default_objects, load_clip, request
 from .show import Busy, Screen, summary
 
 MOTIONS = (".bvh", ".npz")

@@ -103,8 +103,7 @@ def clip_figures(
         times.axes[0].set_xlim((begin - room) / float(found.rate), (end + room) / float(found.rate))
         shown = sorted({begin, (begin + end) // 2, end})
     yield "timeline", times
-    draw = plots.skeleton_3d if isinstance(clip, Motion) else plots.objects_3d
-    yield "scene", draw(clip, found, shown)  # type: ignore[operator]
+    yield "scene", plots.skeleton_3d(clip, found, shown) if isinstance(clip, Motion) else plots.objects_3d(clip, found, shown)
     for name in found.objects:
         for kind in sorted(found.sigma_max):
             part = re.sub(r"[^\w.-]+", "_", name)

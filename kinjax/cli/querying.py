@@ -127,10 +127,9 @@ def store_command(options: StoreCommand) -> int:
     complaints = check(store)
     for complaint in complaints:
         screen.warn(complaint)
-    counts = (
-        ", ".join(f"{store.table(t, ['clip']).num_rows:,} {t}" for t in ("clips", "constraints", "patterns", "errors"))
-        if not complaints
-        else ""
-    )
-    screen.print(f"{len(complaints)} complaints: {options.store}" if complaints else f"whole: {counts}")
+    if complaints:
+        screen.print(f"{len(complaints)} complaints: {options.store}")
+    else:
+        counts = (f"{store.table(t, ['clip']).num_rows:,} {t}" for t in ("clips", "constraints", "patterns", "errors"))
+        screen.print(f"whole: {', '.join(counts)}")
     return WRONG if complaints else 0

@@ -5,20 +5,18 @@ In: options. Out: a loaded clip and the arguments of `kinjax.detect`. Everything
 
 from __future__ import annotations
 
-import ast
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_type_hints
-
-import msgspec
+from typing import Any
 
 from ..annotations import Template, check_type
 from ..detect.settings import Settings
 from ..errors import FileFormatError, OptionError, find_name
 from ..motion import Motion, Poses
+from .assignments import changed_settings
 from .options import Detecting, Reading
 
 Clip = Motion | Poses
@@ -115,51 +113,6 @@ def make_settings(options: Detecting, template_types: Sequence[Any] = ()) -> Set
     }
     changes = {k: v for k, v in changes.items() if v is not None}
     return Settings().but(**(changes | changed_settings(options.set)))
-
-
-def changed_settings(given: Sequence[str]) -> dict[str, Any]:
-    """The settings that `--set NAME=VALUE` changes."""
-
-    def unknown(name: str) -> None:
-        Settings().but(**{name: None})  # says which names are near
-
-    return assignments("--set", given, Settings, _literal, unknown)
-
-
-def assignments(
-    option: str,
-    given: Sequence[str],
-    settings: type,
-    meant: Callable[[str, str], Any],
-    unknown: Callable[[str], object],
-) -> dict[str, Any]:
-    """What the texts NAME=VALUE of an option assign, checked against the types of the fields of `settings`.
-
-    meant: the value of a name and its text, before it is converted to the field's type. unknown: raises for a name that is none.
-    """
-    kinds = get_type_hints(settings)
-    changes: dict[str, Any] = {}
-    for text in given:
-        name, equals, value = text.partition("=")
-        name = name.strip().replace("-", "_")
-        if not equals:
-            raise OptionError(f"{option} {text!r}: write NAME=VALUE")
-        if name not in kinds:
-            unknown(name)
-        try:
-            changes[name] = msgspec.convert(meant(name, value), kinds[name], strict=False)
-        except msgspec.ValidationError as error:
-            raise OptionError(f"{option} {text}: {str(error)[:1].lower()}{str(error)[1:]}") from None
-    return changes
-
-
-def _literal(name: str, text: str) -> Any:
-    """The value of a setting of detection: a Python literal, words with commas between them, or one word."""
-    try:
-        value = ast.literal_eval(text.strip())
-    except (ValueError, SyntaxError):
-        value = tuple(part.strip() for part in text.split(",")) if "," in text or name == "types" else text.strip()
-    return (value,) if name == "types" and isinstance(value, str) else value
 
 
 def default_objects(clip: Clip) -> tuple[tuple[str, ...], str]:

@@ -20,7 +20,7 @@ from pathlib import Path
 from ..errors import OptionError
 from ..formats import motion_suffixes
 from ..formats.files import clean_text
-from ..numerics import bucket
+from ..lengths import bucket
 
 _HEAD = 1 << 16  # bytes of a file that are looked at for hints
 _FRAMES = re.compile(rb"frames?[ \t]*:?\s*(\d{1,9})\s+frame[ \t]*time[ \t]*:?\s*(\S{1,40})", re.IGNORECASE)

@@ -16,7 +16,6 @@ from typing import Any, Literal, get_type_hints
 
 import msgspec
 
-from .. import __version__
 from ..annotations import ConstraintType
 from ..detect.settings import Settings
 from ..errors import FileFormatError, OptionError
@@ -74,9 +73,8 @@ class Configuration:
             raise OptionError(f"subject={self.subject!r} is no regular expression: {error}") from None
         if not groups:
             raise OptionError(f"subject={self.subject!r} needs a group in parentheses: what it matches is the subject")
-        if self.settings.rate is not None or self.settings.method == "paper":
-            if self.settings.method == "paper" and not (self.templates or self.settings.thresholds):
-                raise OptionError('method="paper" needs templates, or thresholds=(sigma_max, eps_max)')
+        if self.settings.method == "paper" and not (self.templates or self.settings.thresholds):
+            raise OptionError('method="paper" needs templates, or thresholds=(sigma_max, eps_max)')
 
     def document(self) -> dict[str, Any]:
         """All of it as plain values, for the manifest."""
@@ -96,6 +94,8 @@ class Configuration:
 @lru_cache(maxsize=1)
 def code_version() -> str:
     """The version, and a hash of the sources that an annotation depends on."""
+    from .. import __version__
+
     package = Path(__file__).resolve().parent.parent
     digest = hashlib.sha256()
     for folder in (".", "detect", "formats", "database"):

@@ -182,13 +182,13 @@ def _cores() -> int:
 
 
 def make_engine(
-    name: str, workers: int | None = None, scheduler: str | None = None, threads: int = 1
+    name: str, workers: int | None = None, scheduler: str | None = None, threads: int = 1, patience: float = 60.0
 ) -> Callable[[], Engine]:
-    """The engine called inline or dask; what it takes is checked now, it starts when it is called."""
+    """The engine called inline or dask; it starts when what is given here is called."""
     if name not in ("inline", "dask"):
         raise OptionError(f"no engine {name!r}: choose from inline, dask")
     if name == "inline":
         if workers not in (None, 1) or scheduler is not None:
             raise OptionError("--workers and --scheduler go with --engine dask")
         return Inline
-    return lambda: DaskWorkers(workers, scheduler, threads)
+    return lambda: DaskWorkers(workers, scheduler, threads, patience=patience)

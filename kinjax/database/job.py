@@ -76,8 +76,10 @@ def annotate(
 
     engine: "inline", "dask", or what makes an `Engine`. timeout: seconds for one file (not inline). attempts: how often a file
     may end its worker before it is refused. part_clips: about how many clips share a file of the store. retry: files
-    that were refused before are tried again, changed or not. cache: a folder in which compiled programs are kept. What changed, or was annotated under another configuration, is
-    annotated anew, and what is no longer in the folders goes from the store; other folders in it stay.
+    that were refused before are tried again, changed or not. cache: a folder in which compiled programs are kept.
+
+    What changed, or was annotated under another configuration, is annotated anew, and what is no longer in the folders goes
+    from the store; other folders in it stay.
 
     Raises `KinjaxError`s for what makes the whole job impossible, and `OSError` where the store cannot be written.
     """

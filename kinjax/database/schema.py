@@ -7,13 +7,15 @@ What the columns mean is told in docs/annotation.md; frames are 0-based, both en
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 
 from ..annotations import TYPES
-from ..detect.results import Detection
+
+if TYPE_CHECKING:
+    from ..detect.results import Detection
 
 VERSION = "kinjax-store/1"
 _TEXT, _WHOLE, _REAL = pa.string(), pa.int64(), pa.float64()

@@ -25,7 +25,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from ..errors import FileFormatError, OptionError
-from ..formats.files import read_bytes, write_atomically
+from ..formats.files import TEMPORARY, read_bytes, write_atomically
 from .catalogue import part_name
 from .schema import TABLES, VERSION
 
@@ -47,9 +47,7 @@ class Store:
         self.path = Path(os.path.abspath(path))
         self.manifest_path = self.path / "manifest.json"
         if not self.manifest_path.is_file():
-            empty = not self.path.exists() or (
-                self.path.is_dir() and not any(p.name not in ("lock", "aside") for p in self.path.iterdir())
-            )
+            empty = not self.path.exists() or (self.path.is_dir() and all(map(_just_begun, self.path.iterdir())))
             if not create or not empty:
                 remedy = "annotate FOLDER -o STORE makes one" if empty else "it holds other things: name another folder"
                 raise OptionError(f"{path} is no store of annotations ({remedy})")
@@ -142,6 +140,9 @@ class Store:
         for left in (self.path / "aside").iterdir():
             if left.is_dir() and not left.is_symlink():
                 shutil.rmtree(left, ignore_errors=True)
+        for folder in (self.path, self.path / "aside"):
+            for half in folder.glob(TEMPORARY):
+                half.unlink(missing_ok=True)
         parts = set(self.parts())
         for table in TABLES:
             for path in (self.path / table).glob("part-*.parquet"):
@@ -196,7 +197,7 @@ class Store:
     def remove(self, parts: Iterable[str]) -> None:
         """Take parts out: first they stop to count, then they go."""
         for part in parts:
-            for table in reversed(TABLES):
+            for table in reversed(list(TABLES)):
                 self.file(table, part).unlink(missing_ok=True)
 
     def without(self, part: str, clips: set[str], written: Path) -> str | None:
@@ -216,6 +217,13 @@ class Store:
         data = msgspec.json.format(msgspec.json.encode(document), indent=1) + b"\n"
         if not (self.manifest_path.is_file() and self.manifest_path.read_bytes() == data):
             write_atomically(self.manifest_path, data)
+
+
+def _just_begun(path: Path) -> bool:
+    """What a job may leave in a new store that it was killed in before there was a manifest."""
+    if path.is_dir():
+        return path.name in (*TABLES, "aside") and not any(path.iterdir())
+    return path.name == "lock" or path.match(TEMPORARY)
 
 
 def write_tables(tables: Mapping[str, pa.Table], folder: Path) -> None:

@@ -40,9 +40,13 @@ class Learnt:
 
 @dataclass(frozen=True)
 class Task:
-    """One part to be worked on. key: of the configuration and what was learnt. aside: the folder to write in. refused: by clip, what is known to be wrong with it and after
-    how many attempts; it is not touched again. limit: seconds for one file, or for the detection in one batch, after which
-    this process is ended (0: none; only where another process looks after this one). cache: where compiled programs are kept."""
+    """One part to be worked on.
+
+    key: of the configuration and what was learnt. aside: the folder to write in. refused: by clip, what is known to be wrong
+    with it and after how many attempts; it is not touched again. limit: seconds for one file, or for the detection in one
+    batch, after which this process is ended (0: none; only where another process looks after this one). cache: where
+    compiled programs are kept.
+    """
 
     part: Part
     configuration: Configuration
@@ -223,7 +227,7 @@ class _Results:
         sources = {n: learnt.source for n, learnt in one.sources.items()}
         self.rows.add("constraints", clip, rows)
         self.rows.add("patterns", clip, pattern_rows(found, one.roles, sources))
-        facts = one.facts | {
+        facts = dict(one.facts) | {
             "objects": list(found.objects),
             "constraints": len(rows["begin"]),
             "missing": int(found.missing.sum()),

@@ -45,14 +45,17 @@ def side_by_side(clips: Sequence[Prepared], room: int) -> tuple[Prepared, list[t
     if isinstance(parts[0], Joints):
         t = _moving(parts[0])
         filled = [_fixed(p, t) for p in parts if isinstance(p, Joints)]
-        nothing = filled[0]._replace(valid=np.zeros_like(filled[0].valid), at=np.full_like(filled[0].at, -1))
-        arrays = Joints(*(np.stack(x) for x in zip(*filled, *[nothing] * (room - len(clips)), strict=True)))
+        unseen: Any = {"valid": np.zeros_like(filled[0].valid), "at": np.full_like(filled[0].at, -1)}
+        nothing = filled[0]._replace(**unseen)
+        stacked: list[Any] = [np.stack(x) for x in zip(*filled, *[nothing] * (room - len(clips)), strict=True)]
+        arrays = Joints(*stacked)
     else:
         q, s, seen = (np.stack(x, axis=-3) for x in zip(*parts, strict=True))
         pad = lambda x, n: np.pad(x, [(0, 0)] * n + [(0, room - len(clips)), (0, 0), (0, 0)])  # noqa: E731
         q, s, seen = pad(q, 1), pad(s, 1), pad(seen, 0)
         q[0, len(clips) :] = 1
-        arrays = Clip(*(x.reshape(*x.shape[:-3], room * lanes, x.shape[-1]) for x in (q, s, seen)))
+        flat: list[Any] = [x.reshape(*x.shape[:-3], room * lanes, x.shape[-1]) for x in (q, s, seen)]
+        arrays = Clip(*flat)
     longest = max(c.frames for c in clips)
     seen = np.zeros((room * lanes, longest), bool)
     origin = np.zeros((room * lanes, 3))
@@ -73,7 +76,7 @@ def side_by_side(clips: Sequence[Prepared], room: int) -> tuple[Prepared, list[t
         names=tuple(names),
         frames=longest,
         original_frames=max(c.original_frames for c in clips),
-        clip="batch",
+        clip=clips[0].clip if len(clips) == 1 else "batch",
     )
     return whole, spans
 

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..kinematics import world_transforms
-from ..numerics import BLOCK, computed_once, packed_bits
+from ..lengths import BLOCK
+from ..numerics import computed_once, packed_bits
 from ..rotations import cross, normalize, rotate
 from . import noise
 from .displacements import Displacement, displacements, mean_pose, spikes

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..annotations import NoisePattern, Template, check_type
 from ..errors import OptionError, TemplateError, TemplateTooShort, find_name
-from ..numerics import bucket
+from ..lengths import bucket
 from .interface import Numbers, Plan
 from .merging import Tolerance
 from .noise import Pattern, Spans

@@ -16,8 +16,8 @@ import numpy as np
 
 from ..errors import OptionError, ShapeError, find_name
 from ..kinematics import object_poses
+from ..lengths import BLOCK, bucket
 from ..motion import Motion, Poses
-from ..numerics import BLOCK, bucket
 from ..quaternions import from_turns, turns
 from .interface import Clip, Joints
 from .settings import Settings
@@ -108,7 +108,7 @@ def resampled(poses: Poses, rate: float | None) -> Poses:
 def prepared(
     source: Motion | Poses, objects: Sequence[str] | None, relative_to: str | None, settings: Settings
 ) -> Prepared:
-    """Arrays padded to a bucket: objects to a power of two, frames to `numerics.bucket`."""
+    """Arrays padded to a bucket: objects to a power of two, frames to `lengths.bucket`."""
     near = settings.formulation == "local"  # the comparison of appendix A is about the world's own origin
     if (
         isinstance(source, Motion)

@@ -28,6 +28,7 @@ _ROOMS = {
     "annotations_io": ("read_annotations", "write_annotations"),
     "edits": ("Edit", "parse_edit", "read_edit", "write_edit"),
     "exports": ("export",),
+    "labels": ("read_labels", "write_labels"),
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 _READERS = {".bvh": "read_bvh", ".amc": "read_amc", ".c3d": "read_c3d", ".npz": "read_motion_npz"}

@@ -19,7 +19,7 @@ MAX_DEPTH = 256
 POSITIONS = {f"{x.lower()}position": f"{x}position" for x in "XYZ"}
 ROTATIONS = {f"{x.lower()}rotation": f"{x}rotation" for x in "XYZ"}
 CHANNELS = POSITIONS | ROTATIONS
-NUMBER = rb"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+NUMBER = rb"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 
 _NUMBER = re.compile(NUMBER)
 _SKIP = re.compile(rb"(?:\s++|(?:#|//)[^\n]*+)*+")

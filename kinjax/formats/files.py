@@ -16,6 +16,9 @@ from ..errors import FileFormatError, OptionError
 
 LIMIT = 4 << 30  # bytes; no motion or annotation file comes near it, a wrong path (a disk image) does
 
+TEMPORARY = ".kinjax-*.tmp"
+"""What a file is called until it is whole; one that is left over is of a process that was killed."""
+
 _CANNOT_OPEN = {
     errno.ENOENT: ("there is no such file", "check the path"),
     errno.ENOTDIR: ("a part of the path is a file, not a folder", "check the path"),
@@ -83,7 +86,7 @@ def write_atomically(path: str | Path, data: bytes) -> Path:
         if isinstance(e, OptionError):
             raise
         raise OptionError(f"{str(path)!r} is no possible file name") from e
-    temporary = target.parent / f".kinjax-{secrets.token_hex(8)}.tmp"
+    temporary = target.parent / TEMPORARY.replace("*", secrets.token_hex(8))
     handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
     try:
         with open(handle, "wb") as f:
