@@ -31,7 +31,6 @@ _NAMES = {
 _NECK = ("neck", "lowerneck", "upperneck", "necklower", "neckbase", "neckupper")
 _HEAD = ("head", "skull")
 _SIDES = {"left": "left", "l": "left", "lft": "left", "right": "right", "r": "right", "rgt": "right"}
-_KNOWN = {w for ws in _NAMES.values() for w in ws}
 _NOISE = {
     "bip",
     "biped",
@@ -56,6 +55,7 @@ _NOISE = {
 }
 # Roles that no part of the mass table needs.
 _MORE = {"toe": ("toe", "toes", "toebase", "toejoint", "ball", "balljoint", "forefoot")}
+_KNOWN = {w for table in (_NAMES, _MORE) for ws in table.values() for w in ws}
 _PELVIS = ("hips", "pelvis", "hip", "root")
 
 GROUPS: Mapping[str, tuple[str, ...]] = MappingProxyType(
@@ -129,12 +129,10 @@ def choose(names: tuple[str, ...], wanted: Sequence[str], where: str = "") -> tu
 def words_of(names: tuple[str, ...]) -> list[tuple[str, str]]:
     """Side ("left", "right" or "") and what is left of each name, in small letters without numbers and decoration."""
     names = tuple(n.split(":")[-1] for n in names)
-    same = list(takewhile(lambda x: x[0] == x[1], zip(min(names), max(names), strict=False)))  # "Bob_" of all names
-    shared = max((i + 1 for i, (c, _) in enumerate(same) if not c.isalnum()), default=0) if len(names) > 1 else 0
+    shared = _shared(names)
     out = []
     for name in names:
-        words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name[shared:])
-        words = [w for w in map(str.lower, words) if w not in _NOISE]
+        words = [w for w in _split(name[shared:]) if w not in _NOISE]
         side = next((_SIDES[w] for w in words if w in _SIDES), "")
         key = "".join(w for w in words if w not in _SIDES)
         if not side:  # in one word: lfemur, rightfoot
@@ -144,6 +142,23 @@ def words_of(names: tuple[str, ...]) -> list[tuple[str, str]]:
                     break
         out.append((side, key))
     return out
+
+
+def _split(name: str) -> list[str]:
+    return [w.lower() for w in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)]
+
+
+def _shared(names: tuple[str, ...]) -> int:
+    """How much stands before all names and tells nothing, such as "Bob_"; what tells a side or a part is no decoration."""
+    if len(names) < 2:
+        return 0
+    same = "".join(c for c, _ in takewhile(lambda x: x[0] == x[1], zip(min(names), max(names), strict=False)))
+    end = 0
+    for some in re.finditer(r"[^\W_]*[\W_]+", same):
+        if any(w in _SIDES or w in _KNOWN for w in _split(some[0])):
+            break
+        end = some.end()
+    return end
 
 
 def _first(words: Sequence[tuple[str, str]], side: str, table: Mapping[str, Sequence[str]]) -> _Side:

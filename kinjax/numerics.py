@@ -20,6 +20,9 @@ Bits = UInt32[Array, "lanes words"]
 """Flags packed 32 to a word."""
 
 
+SLICES = 16
+
+
 def eps_of(x: Float[Array, "..."]) -> float:
     """Machine epsilon of `x`'s dtype."""
     return float(jnp.finfo(x.dtype).eps)
@@ -68,10 +71,16 @@ def order_statistic(
     bits, integer = (32, jnp.int32) if x.dtype == jnp.float32 else (64, jnp.int64)
     keys = jax.lax.bitcast_convert_type(jnp.abs(x), integer)
     keys = jnp.where(mask, keys, jnp.iinfo(integer).max)
+    short = -keys.shape[-1] % SLICES
+    if short:
+        keys = jnp.pad(keys, [(0, 0)] * (keys.ndim - 1) + [(0, short)], constant_values=jnp.iinfo(integer).max)
+    slices = jnp.split(keys, SLICES, axis=-1)
 
     def refine(i: Int[Array, ""], low: Int[Array, "..."]) -> Int[Array, "..."]:
         trial = low | (jnp.ones((), integer) << (jnp.asarray(bits - 2, integer) - i.astype(integer)))
-        below = jnp.sum(keys < trial[..., None], axis=-1, dtype=jnp.int32)
+        # XLA does not vectorise a reduction to a count: slices are added up element by element, what is left is short
+        signs = functools.reduce(jnp.add, ((part - trial[..., None]) >> jnp.asarray(bits - 1, integer) for part in slices))
+        below = -jnp.sum(signs, axis=-1, dtype=jnp.int32)
         return jnp.where(below <= rank, trial, low)
 
     found = jax.lax.fori_loop(0, bits - 1, refine, jnp.zeros(x.shape[:-1], integer))

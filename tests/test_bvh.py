@@ -585,7 +585,7 @@ def test_load_and_save_by_suffix(tmp_path, data):
     m = load(data / "odd_bvh/00_ok.bvh", unit="mm")
     assert load(save(tmp_path / "a.BVH", m)).frames == 4
     np.testing.assert_array_equal(load(save(tmp_path / "a.npz", m)).rotations, m.rotations)
-    with pytest.raises(FileFormatError, match=r"'\.fbx'.*\.bvh, \.npz"):
+    with pytest.raises(FileFormatError, match=r"'\.fbx'.*\.bvh, .*\.npz"):
         load(tmp_path / "a.fbx")
     with pytest.raises(OptionError, match=r"'\.fbx'"):
         save(tmp_path / "a.fbx", m)

@@ -76,7 +76,7 @@ def _configuration(options: Annotate) -> Configuration:
         changes["templates"] = (*base.templates, *rules)
     settings: dict[str, Any] = {"method": options.method, "types": options.type or None}
     settings = {k: v for k, v in settings.items() if v is not None}
-    given = base.settings.but(**settings, **changed_settings(options.set))
+    given = base.settings.but(**(settings | changed_settings(options.set)))
     kinds = {r.type for r in changes.get("templates", base.templates)}
     if not options.type and not kinds <= set(given.types):
         given = given.but(types=(*given.types, *sorted(kinds - set(given.types))))

@@ -10,14 +10,18 @@ import json
 import math
 import shlex
 import sys
+from collections.abc import Sequence
+from decimal import Decimal
 from typing import Any
 
 import pyarrow as pa
 
+from ..annotations import TYPES, check_type
 from ..database.overlaps import When, overlapping
 from ..database.query import query
 from ..database.store import Store
-from ..errors import OptionError
+from ..errors import OptionError, UnknownNameError
+from ..formats.annotations_tables import safe_cell
 from .database_options import Query, StoreCommand
 from .show import Screen, table
 
@@ -34,38 +38,64 @@ def query_command(options: Query) -> int:
     if options.sql is not None:
         found = query(store, options.sql)
     else:
-        found = overlapping(store, *(_when(text) for text in options.when), least=options.least)
+        conditions = [_when(text) for text in options.when]
+        found = overlapping(store, *conditions, least=options.least)
+        if not found.num_rows:
+            _unknown(store, conditions)
     if options.play:
         return _play(found)
     if options.format == "csv":
         _csv(found)
     elif options.format == "json":
-        print(json.dumps([_finite(row) for row in found.to_pylist()], default=str, indent=1))
+        print(json.dumps(_plain(found.to_pylist()), default=str, indent=1))
     else:
         _table(found, options.limit)
     return 0
 
 
 def _when(text: str) -> When:
-    """A condition of `OBJECT[:TYPE][:SECONDS]`; * is any object."""
-    name, *more = text.split(":")
-    kind, longer = None, 0.0
-    for part in more:
-        try:
-            longer = float(part)
-        except ValueError:
-            if kind is not None:
-                raise OptionError(f"--when {text!r}: write OBJECT, OBJECT:TYPE, OBJECT:TYPE:SECONDS") from None
-            kind = part
+    """A condition of `OBJECT[:TYPE][:SECONDS]`, read from its end, since an object's name may hold colons; * is any object."""
+    parts, kind, longer = text.split(":"), None, 0.0
+    if len(parts) > 1 and (seconds := _seconds(parts[-1])) is not None:
+        longer = seconds
+        parts.pop()
+    if len(parts) > 1 and parts[-1] in ("", *TYPES):
+        kind = parts.pop() or None
+    name = ":".join(parts)
+    if len(parts) > 1 and _seconds(parts[-1]) is not None:
+        raise OptionError(f"--when {text!r}: write OBJECT, OBJECT:TYPE, OBJECT:SECONDS or OBJECT:TYPE:SECONDS")
     return When(None if name in ("", "*") else name, kind, longer)
+
+
+def _seconds(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def _unknown(store: Store, conditions: Sequence[When]) -> None:
+    """Nothing was found: `OptionError` if that is because no clip has what a condition names."""
+    asked = [c.object for c in conditions if c.object is not None]
+    if not asked:
+        return
+    found = query(store, "SELECT unnest(objects) FROM clips UNION SELECT role FROM patterns UNION SELECT object FROM patterns")
+    known = [name for name in found[0].to_pylist() if name is not None]
+    for name in asked:
+        if known and name.casefold() not in {k.casefold() for k in known}:
+            head, colon, last = name.rpartition(":")
+            if colon and head.casefold() in {k.casefold() for k in known}:
+                check_type(last)
+            raise UnknownNameError(name, sorted(known), "object or role", str(store.path))
 
 
 def _table(found: pa.Table, limit: int) -> None:
     shown = found.slice(0, limit) if limit > 0 else found
-    numbers = [i for i, f in enumerate(found.schema) if pa.types.is_integer(f.type) or pa.types.is_floating(f.type)]
+    kinds = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal)
+    numbers = [i for i, f in enumerate(found.schema) if any(is_kind(f.type) for is_kind in kinds)]
     rows = [tuple(_cell(v) for v in row.values()) for row in shown.to_pylist()]
     screen = Screen()
-    screen.print(table(tuple(found.schema.names), rows, numbers=numbers))
+    screen.print(table(tuple(map(_cell, found.schema.names)), rows, numbers=numbers))
     rest = found.num_rows - shown.num_rows
     more = f", {rest:,} more: --limit 0 shows all" if rest else ""
     screen.print(f"{found.num_rows:,} row{'s' * (found.num_rows != 1)}{more}")
@@ -84,19 +114,26 @@ def _cell(value: Any) -> str:
 def _csv(found: pa.Table) -> None:
     """Rows as CSV; what a spreadsheet would take for a formula gets an apostrophe in front."""
     out = csv.writer(sys.stdout, lineterminator="\n")
-    out.writerow(found.schema.names)
+    out.writerow(map(safe_cell, found.schema.names))
     for row in found.to_pylist():
         out.writerow([_safe(v) for v in row.values()])
 
 
 def _safe(value: Any) -> Any:
-    if isinstance(value, str) and value[:1] in tuple("=+-@\t\r"):
-        return "'" + value
-    return json.dumps(value) if isinstance(value, list) else value
+    if value is None or isinstance(value, bool | int | float | Decimal):
+        return value
+    return safe_cell(value if isinstance(value, str) else json.dumps(_plain(value), default=str))
 
 
-def _finite(row: dict[str, Any]) -> dict[str, Any]:
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
+def _plain(value: Any) -> Any:
+    """Values that JSON has: what is no number is null, sums of whole numbers are whole."""
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, Decimal):
+        return int(value) if value == value.to_integral_value() else float(value)
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _play(found: pa.Table) -> int:
@@ -104,14 +141,31 @@ def _play(found: pa.Table) -> int:
     if "path" not in found.schema.names:
         raise OptionError('--play needs the column path: SELECT clip, path, begin, "end" FROM constraints ...')
     for row in found.to_pylist():
+        if row["path"] is None:
+            continue
         command = ["kinjax", "plot", str(row["path"])]
         if row.get("begin") is not None and row.get("end") is not None:
-            command += ["--frames", f"{row['begin']}:{row['end']}"]
-        objects = [str(v) for k, v in row.items() if (k == "object" or k.startswith("object_")) and v]
-        if objects:
-            command += ["--object", *dict.fromkeys(objects)]
-        print(shlex.join(command))
+            command += ["--frames", f"{math.floor(row['begin'])}:{math.ceil(row['end'])}"]
+        if objects := _values(row, "object"):
+            command += ["--object", *objects]
+        if set(types := _values(row, "type")) - {"space"}:
+            command += ["--type", *dict.fromkeys(("space", *types))]  # pivots are found beside rests
+        print(" ".join(map(_quoted, command)))
     return 0
+
+
+def _values(row: dict[str, Any], name: str) -> list[str]:
+    """What a row has under NAME, NAME_1, NAME_2, ..., each once."""
+    return list(dict.fromkeys(str(v) for k, v in row.items() if (k == name or k.startswith(f"{name}_")) and v))
+
+
+def _quoted(text: str) -> str:
+    """A word for a shell; control characters as escapes (bash and zsh), so that a terminal shows them and does not obey."""
+    return shlex.quote(text) if text.isprintable() else "$'" + "".join(map(_escaped, text)) + "'"
+
+
+def _escaped(c: str) -> str:
+    return c if c.isprintable() and c not in "\\'" else f"\\U{ord(c):08x}"
 
 
 def store_command(options: StoreCommand) -> int:

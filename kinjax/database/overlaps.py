@@ -31,6 +31,8 @@ class When:
 
     def sql(self, name: str) -> tuple[str, list[object]]:
         """The condition on the table called `name`, and its parameters."""
+        if not (self.longer >= 0 and self.shorter >= 0):
+            raise OptionError(f"longer={self.longer}, shorter={self.shorter}: give seconds, not negative")
         parts, values = [f"{name}.duration_s >= ?", f"{name}.duration_s <= ?"], [self.longer, self.shorter]
         found: list[object] = list(values)
         if self.object is not None:
@@ -50,6 +52,8 @@ def overlapping(store: Store | str, *conditions: When, least: float = 0.0) -> pa
     """
     if not conditions:
         raise OptionError("overlapping needs at least one condition")
+    if not least >= 0:
+        raise OptionError(f"least={least}: give seconds, not negative")
     names = [f"c{i}" for i in range(1, len(conditions) + 1)]
     tables, wheres, parameters = [], [], list[object]()
     for name, condition in zip(names, conditions, strict=True):

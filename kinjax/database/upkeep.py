@@ -39,8 +39,8 @@ def check(store: Store) -> list[str]:
     for part in parts:
         try:
             tables = {t: store.part(t, part) for t in TABLES}
-        except KinjaxError as error:
-            told.append(str(error))
+        except (KinjaxError, pa.ArrowException, OSError) as error:
+            told.append(str(error) if isinstance(error, KinjaxError) else f"part {part} cannot be read: {error}")
             continue
         for name, t in tables.items():
             if not t.schema.equals(TABLES[name]):

@@ -183,21 +183,21 @@ def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool) 
     moving = [(k, j) for k, j in enumerate(top.translated) if j in new]
     dtype, frames = working_dtype(), motion.frames
     length, room = bucket(frames + BLOCK), 8 * -(-len(joints) // 8)
-    q, t = np.asarray(motion.rotations), np.asarray(motion.translations)
-    if len(joints) < q.shape[1]:
-        q = q[:, joints]
+    q, t = np.moveaxis(np.asarray(motion.rotations), 0, -1), np.asarray(motion.translations)
     t = np.asarray(t[:, [k for k, _ in moving]], float)
     valid: Any = np.ones(frames, bool)
-    if not (np.isfinite(q).all() and np.isfinite(t).all()):  # frame by frame takes three times as long
-        valid = np.isfinite(q).all((1, 2)) & np.isfinite(t).all((1, 2))
+    rotations = np.zeros((room, 4, length), dtype)
+    for i, j in enumerate(joints):
+        rotations[i, :, :frames] = q[j]
+    rotations[:, 0, frames:] = rotations[len(joints) :, 0] = 1
+    if not (np.isfinite(rotations).all() and np.isfinite(t).all()):  # frame by frame takes three times as long
+        valid = np.isfinite(rotations[..., :frames]).all((0, 1)) & np.isfinite(t).all((1, 2))
     root = np.array([top.parents[j] < 0 for _, j in moving])
     origin = t[np.argmax(valid), int(np.argmax(root))] if near and valid.any() and root.any() else np.zeros(3)
     t = t - root[:, None] * origin
     if not valid.all():
-        q, t = np.where(valid[:, None, None], q, [1, 0, 0, 0]), np.where(valid[:, None, None], t, 0)
-    rotations = np.zeros((room, 4, length), dtype)
-    rotations[: len(joints), :, :frames] = q.transpose(1, 2, 0)
-    rotations[:, 0, frames:] = rotations[len(joints) :, 0] = 1
+        t = np.where(valid[:, None, None], t, 0)
+        rotations[:, :, np.flatnonzero(~valid)] = np.array([1, 0, 0, 0], dtype)[:, None]
     translations = np.zeros((len(moving), 3, length), dtype)
     translations[..., :frames] = t.transpose(1, 2, 0)
     mask = np.zeros(length, bool)

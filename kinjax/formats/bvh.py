@@ -14,6 +14,7 @@ The header is parsed in `bvh_header`, the numbers in `bvh_numbers`, the unit is 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import get_args
@@ -26,11 +27,12 @@ from ..skeleton import Axis, Skeleton, Topology
 from .bvh_header import Header, fail, parse_header
 from .bvh_numbers import read_numbers
 from .bvh_units import additive_notes, infer_unit, rest_extent, scale_of, unit_note
-from .euler import euler_to_quaternion
+from .euler import quaternion_parts
 from .files import read_bytes
 
+_SOLID = re.compile(rb"[^ \t\r\n\v\f\x00\x1a]")
 _MOST = 1 << 27  # joint-frames: 4 GiB of rotations
-_BLOCK = 128  # frames at a time: what lies between numbers and quaternions stays in the cache
+_BLOCK = 1 << 13  # joint-frames at a time: what lies between numbers and quaternions stays in the cache
 
 
 Choose = Callable[[tuple[str, ...]], Iterable[int]]
@@ -93,7 +95,7 @@ def _plain(raw: bytes, path: object) -> tuple[bytes, list[str]]:
     """The text of a file with `\\n` as line end, and notes; refuses what is no text."""
     notes = []
     raw = raw.removeprefix(b"\xef\xbb\xbf")
-    if not raw.strip(b" \t\r\n\v\f\x00\x1a"):
+    if _SOLID.search(raw) is None:
         raise FileFormatError("the file is empty", path=path, remedy="get a complete copy")
     if raw[:2] in (b"\xff\xfe", b"\xfe\xff") or raw[:2].count(0) == 1:
         raise FileFormatError("the file is UTF-16 text", path=path, line=1, column=1, remedy="save it as UTF-8 or ASCII")
@@ -173,17 +175,23 @@ def _with_ancestors(joints: Iterable[int], parents: tuple[int, ...]) -> set[int]
 
 
 def _rotations(values: np.ndarray, topology: Topology, wanted: set[int] | None = None) -> np.ndarray:
-    """Local rotations (frames, joints, 4); joints with the same order of rotation channels are done together."""
+    """Local rotations (frames, joints, 4), in memory one row of frames a component; few joints of short clips are done together."""
     groups: dict[str, list[tuple[int, list[int]]]] = {}
     for j, (channels, first) in enumerate(zip(topology.channels, _columns(topology), strict=True)):
         if wanted is not None and j not in wanted:
             continue
         turns = [(c[0].lower(), first + n) for n, c in enumerate(channels) if c.endswith("rotation")]
         groups.setdefault("".join(axis for axis, _ in turns), []).append((j, [column for _, column in turns]))
-    shape = len(values), len(topology.names), 4
-    out = np.empty(shape) if wanted is None else np.full(shape, np.nan)
+    frames = len(values)
+    out = np.empty((len(topology.names), 4, frames))
+    if wanted is not None:
+        out[[j for j in range(len(out)) if j not in wanted]] = np.nan
+    rows, some = values.T, max(1, _BLOCK // max(frames, 1))
     for axes, members in groups.items():
-        joints, columns = [j for j, _ in members], np.array([c for _, c in members], int)
-        for f in range(0, len(values), _BLOCK):
-            out[f : f + _BLOCK, joints] = euler_to_quaternion(values[f : f + _BLOCK, columns], axes)
-    return out
+        for at in range(0, len(members), some):
+            block = members[at : at + some]
+            columns = np.array([c for _, c in block], int)
+            parts = quaternion_parts(rows[columns.T] if len(block) > 1 else rows[columns[0]][:, None], axes)
+            for component, part in enumerate(parts):
+                out[[j for j, _ in block], component] = part
+    return out.transpose(2, 0, 1)

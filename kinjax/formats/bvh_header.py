@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, field
+from collections import deque
+from dataclasses import dataclass, field, replace
 from typing import NoReturn
 
 from ..errors import FileFormatError
@@ -51,6 +52,9 @@ class Header:
     frame_time: float = math.nan
     data_at: int = 0
     notes: list[str] = field(default_factory=list)
+
+
+_RECENT: deque[tuple[bytes, Header]] = deque(maxlen=16)
 
 
 def fail(raw: bytes, at: int, path: object, found: str, remedy: str) -> NoReturn:
@@ -218,8 +222,20 @@ class _Parser:
 
 
 def parse_header(raw: bytes, path: object = None) -> Header:
-    """The header of a BVH file. `FileFormatError` with line, column and remedy where it is none."""
+    """The header of a BVH file. `FileFormatError` with line, column and remedy where it is none.
+
+    A hierarchy that stood in one of the last files, word for word, is not parsed again: its nodes are shared.
+    """
     parser = _Parser(raw, path)
-    parser.hierarchy()
+    for text, before in _RECENT:
+        if raw.startswith(text):
+            parser.header = Header(before.joints, before.ends, notes=list(before.notes))
+            parser.at = len(text)
+            break
+    else:
+        parser.hierarchy()
+        text = raw[: parser.at + 1]
+        if text[-1:].isspace():  # else the word may go on in another file
+            _RECENT.appendleft((text, replace(parser.header, notes=list(parser.header.notes))))
     parser.motion()
     return parser.header
