@@ -18,7 +18,7 @@ import pyarrow as pa
 
 from ..annotations import TYPES, check_type
 from ..database.overlaps import When, overlapping
-from ..database.query import query
+from ..database.sql import query
 from ..database.store import Store
 from ..errors import OptionError, UnknownNameError
 from ..formats.annotations_tables import safe_cell
@@ -145,7 +145,7 @@ def _play(found: pa.Table) -> int:
             continue
         command = ["kinjax", "plot", str(row["path"])]
         if row.get("begin") is not None and row.get("end") is not None:
-            command += ["--frames", f"{math.floor(row['begin'])}:{math.ceil(row['end'])}"]
+            command += ["--frames", f"{max(0, math.floor(row['begin']))}:{math.ceil(row['end'])}"]
         if objects := _values(row, "object"):
             command += ["--object", *objects]
         if set(types := _values(row, "type")) - {"space"}:

@@ -14,7 +14,7 @@ _ROOMS = {
     "configuration": ("Configuration", "TemplateRule", "read_configuration"),
     "job": ("Report", "annotate"),
     "overlaps": ("When", "overlapping"),
-    "query": ("query",),
+    "sql": ("query",),
     "store": ("Store",),
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}

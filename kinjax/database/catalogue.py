@@ -20,7 +20,7 @@ from pathlib import Path
 from ..errors import OptionError
 from ..formats import motion_suffixes
 from ..formats.files import clean_text
-from ..lengths import bucket
+from ..lengths import BLOCK, octave
 
 _HEAD = 1 << 16  # bytes of a file that are looked at for hints
 _FRAMES = re.compile(rb"frames?[ \t]*:?\s*(\d{1,9})\s+frame[ \t]*time[ \t]*:?\s*(\S{1,40})", re.IGNORECASE)
@@ -167,7 +167,7 @@ def _bvh_hints(path: Path) -> tuple[str, ...]:
         return ("no header",)
     nodes = b" ".join(a or b for a, b in _NODE.findall(head, 0, found.start()))
     frames = min(int(found[1]), 1 << 24)
-    return hashlib.sha256(nodes).hexdigest()[:12], str(bucket(frames + 32)), found[2].decode("latin-1")
+    return hashlib.sha256(nodes).hexdigest()[:12], str(octave(frames + BLOCK)), found[2].decode("latin-1")
 
 
 def in_parts(entries: Iterable[Entry], configuration: str, clips: int = 64) -> list[Part]:

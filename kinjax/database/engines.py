@@ -16,6 +16,10 @@ from typing import Any, Protocol
 from ..errors import KinjaxError, OptionError
 from .work import Receipt, Task, annotate_part, one_thread
 
+KEEP_MEMORY = {"MALLOC_TRIM_THRESHOLD_": "1000000000", "MALLOC_MMAP_THRESHOLD_": "1000000000"}
+"""A clip's arrays have the size of the last one's: memory that goes back to the system in between costs a fault a page (Dask gives
+all of it back by default)."""
+
 AHEAD = 3  # tasks that each worker has or waits with: enough to be busy, few enough to stop soon
 
 
@@ -92,6 +96,7 @@ class DaskWorkers(AbstractContextManager["DaskWorkers"]):
                 "distributed.worker.multiprocessing-method": "spawn",
                 "distributed.scheduler.allowed-failures": self.deaths - 1,
                 "distributed.worker.daemon": True,
+                "distributed.nanny.pre-spawn-environ": KEEP_MEMORY,
                 "distributed.comm.timeouts.connect": "30s",
                 "distributed.admin.log-length": 100,
                 "logging": {"distributed": "critical", "asyncio": "critical"},

@@ -15,7 +15,7 @@ import pyarrow as pa
 
 from ..annotations import check_type
 from ..errors import OptionError
-from .query import query
+from .sql import query
 from .store import Store
 
 

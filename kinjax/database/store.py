@@ -106,7 +106,7 @@ class Store:
 
     def connect(self) -> DuckDBPyConnection:
         """A DuckDB connection with the four tables as views, which can read this store and nothing else."""
-        from .query import connect
+        from .sql import connect
 
         return connect(self)
 

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import msgspec
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from ..errors import KinjaxError
 from ..formats.files import write_atomically
@@ -75,7 +74,7 @@ def compact(store: Store, rows: int = ROWS) -> tuple[int, int]:
         groups: list[list[str]] = [[]]
         held = 0
         for part in before:
-            size = pq.read_metadata(store.file("constraints", part)).num_rows
+            size = store.part("constraints", part, []).num_rows
             if groups[-1] and held + size > rows:
                 groups.append([])
                 held = 0

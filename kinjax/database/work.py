@@ -242,6 +242,7 @@ def _prepare(entry: Entry, task: Task) -> _Read:
     """One clip read, its objects chosen, its patterns found."""
     from ..detect.prepare import prepared
     from ..joint_names import choose, role_of
+    from ..lengths import octave
     from ..motion import Motion
 
     configuration = task.configuration
@@ -256,7 +257,7 @@ def _prepare(entry: Entry, task: Task) -> _Read:
     roles = {names[j]: role_of(names, j) for j in at}
     skeleton = skeleton_key(source)
     subject = configuration.subject_of(Path(entry.path).stem, Path(entry.path).parent.name)
-    one = prepared(source, objects, None, configuration.settings)
+    one = prepared(source, objects, None, configuration.settings, octave)
     patterns, sources = [], {}
     for name in objects:
         learnt = _teacher(task.learnt, name, roles[name], skeleton, subject)

@@ -7,7 +7,7 @@ object (float64 on the host), so that float32 is as good 1 km from the origin as
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,6 +21,9 @@ from ..motion import Motion, Poses
 from ..quaternions import from_turns, turns
 from .interface import Clip, Joints
 from .settings import Settings
+
+Padded = Callable[[int], int]
+"""From a number of frames to the length of the arrays: `lengths.bucket` or `lengths.octave`."""
 
 
 @dataclass(frozen=True)
@@ -106,9 +109,13 @@ def resampled(poses: Poses, rate: float | None) -> Poses:
 
 
 def prepared(
-    source: Motion | Poses, objects: Sequence[str] | None, relative_to: str | None, settings: Settings
+    source: Motion | Poses,
+    objects: Sequence[str] | None,
+    relative_to: str | None,
+    settings: Settings,
+    padded: Padded = bucket,
 ) -> Prepared:
-    """Arrays padded to a bucket: objects to a power of two, frames to `lengths.bucket`."""
+    """Arrays padded to a bucket: objects to a power of two, frames to what `padded` makes of their number."""
     near = settings.formulation == "local"  # the comparison of appendix A is about the world's own origin
     if (
         isinstance(source, Motion)
@@ -116,7 +123,7 @@ def prepared(
         and relative_to is None
         and settings.rate in (None, source.rate)
     ):
-        return _prepared_joints(source, objects, near)
+        return _prepared_joints(source, objects, near, padded)
     poses = as_poses(source, objects, relative_to)
     original = float(poses.rate), poses.frames
     check_rate(original[0])
@@ -131,7 +138,7 @@ def prepared(
     if not valid.all():
         seen = valid.T[..., None]
         rotation, position = np.where(seen, rotation, [1, 0, 0, 0]), np.where(seen, position, 0.0)
-    world = padded_clip(rotation.T, position.T, valid)
+    world = padded_clip(rotation.T, position.T, valid, padded)
     return Prepared(
         world,
         valid,
@@ -152,10 +159,10 @@ def check_rate(rate: float) -> None:
         raise OptionError(f"rate is {rate}: it must be a positive number of frames a second")
 
 
-def padded_clip(rotation: np.ndarray, position: np.ndarray, valid: np.ndarray) -> Clip:
+def padded_clip(rotation: np.ndarray, position: np.ndarray, valid: np.ndarray, padded: Padded = bucket) -> Clip:
     """Poses (..., objects, frames) in the working precision, padded with unseen identity poses."""
     objects, frames = valid.shape
-    lanes, length, dtype = 1 << (objects - 1).bit_length(), bucket(frames + BLOCK), working_dtype()
+    lanes, length, dtype = 1 << (objects - 1).bit_length(), padded(frames + BLOCK), working_dtype()
     out: tuple[Any, ...] = tuple(
         np.zeros((*n, lanes, length), k) for n, k in (((4,), dtype), ((3,), dtype), ((), np.bool_))
     )
@@ -165,7 +172,7 @@ def padded_clip(rotation: np.ndarray, position: np.ndarray, valid: np.ndarray) -
     return Clip(*out)
 
 
-def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool) -> Prepared:
+def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool, padded: Padded) -> Prepared:
     """A motion as the engine takes it: only the objects and their ancestors, so that one hand costs one arm."""
     check_rate(float(motion.rate))
     top = motion.skeleton.topology
@@ -182,7 +189,7 @@ def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool) 
     new = {old: i for i, old in enumerate(joints)}
     moving = [(k, j) for k, j in enumerate(top.translated) if j in new]
     dtype, frames = working_dtype(), motion.frames
-    length, room = bucket(frames + BLOCK), 8 * -(-len(joints) // 8)
+    length, room = padded(frames + BLOCK), 8 * -(-len(joints) // 8)
     q, t = np.moveaxis(np.asarray(motion.rotations), 0, -1), np.asarray(motion.translations)
     t = np.asarray(t[:, [k for k, _ in moving]], float)
     valid: Any = np.ones(frames, bool)

@@ -5,8 +5,9 @@ header says, each frame beginning on a line of its own (or several whole frames 
 that points at the first number or line that is wrong. One whole frame more than declared is read, with a note: some
 exporters count the intervals. One frame less is a file cut short, and refused.
 
-Fastest, for files with one frame a line and single spaces: pyarrow's CSV reader takes the lines as rows. Else white space becomes line ends, and pyarrow's CSV reader parses one column in parallel blocks, skipping empty
-lines; it refuses what is no number, but lets NaN and infinities through. Nothing is allocated from the declared size.
+Fastest, for files with one frame a line and single spaces: pyarrow's CSV reader takes the lines as rows. Else white space
+becomes line ends, and it parses one column in parallel blocks, skipping empty lines. It refuses what is no number, but lets
+NaN and infinities through. Nothing is allocated from the declared size.
 """
 
 from __future__ import annotations

@@ -97,7 +97,8 @@ def _check(connection: DuckDBPyConnection, sql: str) -> None:
 
 def _told(error: duckdb.Error, store: Store) -> KinjaxError:
     """What went wrong: the query, or the files."""
-    if type(error) is duckdb.Error or isinstance(error, duckdb.IOException) or "magic bytes" in str(error):
+    of_files = isinstance(error, duckdb.IOException | duckdb.InvalidInputException) and str(store.path) in str(error)
+    if type(error) is duckdb.Error or of_files:
         remedy = "ask again if a job is writing to it; else `kinjax store check` tells what is wrong"
         return FileFormatError(f"this store cannot be read: {error}", path=store.path, remedy=remedy)
     return OptionError(f"the query is wrong: {error}")
