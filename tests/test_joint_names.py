@@ -153,7 +153,7 @@ def test_the_roles_of_an_exporter(exporter):
 @pytest.mark.parametrize("exporter", EXPORTERS)
 def test_roles_do_not_depend_on_other_joints(exporter):
     """A BVH of which only the feet are read has the same feet, and so has one side alone."""
-    names, expected = skeleton(exporter)
+    _, expected = skeleton(exporter)
     wanted = [n for r, n in expected.items() if r.endswith(("foot", "hand"))]
     assert {expected[r] for r in roles(tuple(wanted))} == set(wanted)
     for side in ("left", "right"):
