@@ -93,11 +93,11 @@ def test_a_file_that_kills_and_one_that_hangs_end_in_errors(clips, cache, tmp_pa
     for name in ("kills.bvh", "hangs.bvh"):
         (folder / "s00" / name).write_bytes((folder / "s00" / "00_000.bvh").read_bytes())
     env = hooked(tmp_path / "hook", cases.HARMFUL)
-    more = ("--engine", "dask", "--workers", "2", "--part-clips", "4", "--timeout", "8", "--attempts", "2")
+    more = ("--engine", "dask", "--workers", "2", "--part-clips", "4", "--timeout", "5", "--attempts", "2")
     told = finish(job(folder, tmp_path / "s", cache, *more, env=env), 3)
     rows = {Path(r["clip"]).name: r for r in Store(tmp_path / "s").table("errors").to_pylist()}
     assert {n: (r["kind"], r["attempts"]) for n, r in rows.items()} == {"kills.bvh": ("killed", 2), "hangs.bvh": ("timeout", 2)}, told
-    assert "SIGKILL" in rows["kills.bvh"]["message"] and "8 s" in rows["hangs.bvh"]["message"]
+    assert "SIGKILL" in rows["kills.bvh"]["message"] and "5 s" in rows["hangs.bvh"]["message"]
     assert Store(tmp_path / "s").table("clips").num_rows == 12 and check(Store(tmp_path / "s")) == []
 
 

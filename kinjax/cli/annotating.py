@@ -15,8 +15,9 @@ from typing import Any
 
 from ..annotations import check_type
 from ..database.configuration import Configuration, TemplateRule, read_configuration
-from ..database.engines import NoWorkers, make_engine
+from ..database.engines import make_engine
 from ..database.job import Progress, Report, annotate
+from ..database.work import JobFailed
 from ..errors import KinjaxError, OptionError
 from .assignments import changed_settings
 from .cache import cache_folder
@@ -50,7 +51,7 @@ def annotate_command(options: Annotate) -> int:
                 cache=cache_folder(),
                 progress=progress,
             )
-    except NoWorkers as error:
+    except JobFailed as error:
         return _failed(error)
     except OSError as error:
         return _failed(f"{error.filename or options.output}: {error.strerror or error}")

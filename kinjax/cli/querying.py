@@ -15,6 +15,7 @@ from decimal import Decimal
 from typing import Any
 
 import pyarrow as pa
+from rich.cells import cell_len
 
 from ..annotations import TYPES, check_type
 from ..database.overlaps import When, overlapping
@@ -23,9 +24,10 @@ from ..database.store import Store
 from ..errors import OptionError, UnknownNameError
 from ..formats.annotations_tables import safe_cell
 from .database_options import Query, StoreCommand
-from .show import Screen, table
+from .show import Screen
 
 WRONG = 3
+CELL = 60  # characters of a table's cell on a terminal
 
 
 def query_command(options: Query) -> int:
@@ -90,24 +92,35 @@ def _unknown(store: Store, conditions: Sequence[When]) -> None:
 
 
 def _table(found: pa.Table, limit: int) -> None:
+    """Rows in columns as wide as they need, whatever the terminal is; on one, cells that are very long are cut."""
     shown = found.slice(0, limit) if limit > 0 else found
-    kinds = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal)
-    numbers = [i for i, f in enumerate(found.schema) if any(is_kind(f.type) for is_kind in kinds)]
-    rows = [tuple(_cell(v) for v in row.values()) for row in shown.to_pylist()]
     screen = Screen()
-    screen.print(table(tuple(map(_cell, found.schema.names)), rows, numbers=numbers))
+    most = CELL if screen.live else sys.maxsize
+    rows = [[_cell(v, most) for v in row.values()] for row in shown.to_pylist()]
+    kinds = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal)
+    right = [any(is_kind(f.type) for is_kind in kinds) for f in found.schema]
+    rows.insert(0, [_cell(name, most) for name in found.schema.names])
+    widths = [max(map(cell_len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        padded = (" " * (w - cell_len(x)) + x if r else x + " " * (w - cell_len(x)) for x, w, r in zip(row, widths, right, strict=True))
+        screen.print("  ".join(padded).rstrip())
     rest = found.num_rows - shown.num_rows
     more = f", {rest:,} more: --limit 0 shows all" if rest else ""
     screen.print(f"{found.num_rows:,} row{'s' * (found.num_rows != 1)}{more}")
 
 
-def _cell(value: Any) -> str:
+def _cell(value: Any, most: int = sys.maxsize) -> str:
+    text = _text(value)
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
+def _text(value: Any) -> str:
     if value is None:
         return ""
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, list):
-        return ", ".join(_cell(v) for v in value)
+        return ", ".join(map(_text, value))
     return "".join(c if c.isprintable() else "?" for c in str(value))
 
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from queue import Empty, SimpleQueue
 from typing import Any, Protocol
 
-from ..errors import KinjaxError, OptionError
-from .work import Receipt, Task, annotate_part, one_thread
+from ..errors import OptionError
+from .work import JobFailed, Receipt, Task, annotate_part, one_thread
 
 KEEP_MEMORY = {"MALLOC_TRIM_THRESHOLD_": "1000000000", "MALLOC_MMAP_THRESHOLD_": "1000000000"}
 """A clip's arrays have the size of the last one's: memory that goes back to the system in between costs a fault a page (Dask gives
@@ -43,7 +43,7 @@ class Engine(Protocol):
         ...
 
 
-class NoWorkers(KinjaxError):
+class NoWorkers(JobFailed):
     """All workers are gone, or none came."""
 
 

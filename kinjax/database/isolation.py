@@ -14,60 +14,55 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from .work import Receipt, Task, annotate_part, one_thread
-
-STARTING = 120.0
-"""Seconds that a process may take before it says anything: it loads and compiles first."""
+from .work import COMPILING, JobFailed, Receipt, Task, annotate_part, one_thread
 
 
 def find_poison(task: Task, attempts: int, limit: float) -> dict[str, tuple[str, str, int]]:
-    """The clips of a part that end their process or take longer than `limit` seconds, `attempts` times each."""
-    context = multiprocessing.get_context("spawn")
+    """The clips of a part that end their process, or take longer than `limit` seconds to be read, `attempts` times each."""
     strikes: Counter[str] = Counter()
     refused = dict(task.refused)
-    for _ in range(attempts * len(task.part.entries) + 1):
-        ours, theirs = context.Pipe(duplex=False)
-        process = context.Process(
-            target=_examine, args=(replace(task, refused=dict(refused), limit=0.0), theirs), daemon=True
-        )
-        process.start()
-        theirs.close()
-        at, why = "", ""
+    for _ in range(attempts * (len(task.part.entries) + 1)):
+        clip, kind, why = _one_process(replace(task, refused=dict(refused), limit=0.0), limit)
+        if kind == "":
+            return refused
+        strikes[clip] += 1
+        if strikes[clip] >= attempts:
+            if clip == "":  # it ends before it touches a file: nothing to blame
+                raise JobFailed(f"a process for single files {why} {attempts} times before its first file")
+            refused[clip] = kind, why, strikes[clip]
+    raise JobFailed(f"part {task.part.key} ends every process that works on it")
+
+
+def _one_process(task: Task, limit: float) -> tuple[str, str, str]:
+    """The clip that a process came to its end with ("": none yet), and how: kind and words, empty if it did all."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_examine, args=(task, theirs), daemon=True)
+    process.start()
+    theirs.close()
+    clip, reading = "", False
+    try:
         while True:
-            if not ours.poll(limit if at else max(limit, STARTING)):
-                why = f"took longer than {limit:g} s"
-                break
-            try:
-                said = ours.recv()
-            except (EOFError, OSError):
-                break
-            if said == "":
-                process.join()
-                return refused
-            at = said
+            if not ours.poll(limit if reading else limit + COMPILING):  # it loads and compiles at first
+                return clip, "timeout", f"took longer than {limit:g} s"
+            clip, reading = ours.recv()
+            if clip == "":
+                return "", "", ""
+    except (EOFError, OSError):
+        process.join()
+        return clip, "killed", f"ended its process ({_how(process.exitcode)})"
+    finally:
         process.kill()
         process.join()
         ours.close()
-        if not at:  # it died before it touched a file: nothing to blame
-            strikes[""] += 1
-            if strikes[""] >= attempts:
-                raise RuntimeError(
-                    f"a process for single files ended {attempts} times before its first file: {process.exitcode}"
-                )
-            continue
-        strikes[at] += 1
-        if strikes[at] >= attempts:
-            kind = "timeout" if why else "killed"
-            refused[at] = kind, why or f"ended its process ({_how(process.exitcode)})", strikes[at]
-    raise RuntimeError(f"part {task.part.key} ends every process that works on it")
 
 
 def _examine(task: Task, pipe: Any) -> None:
-    """In the other process: work on the part, clip by clip, and say which one begins; "" when all are done."""
+    """In the other process: work on the part, clip by clip, and say which one begins and whether it is being read."""
     one_thread()
-    receipt: Receipt = annotate_part(task, begun=pipe.send)
+    receipt: Receipt = annotate_part(task, begun=lambda clip, read: pipe.send((clip, not read)))
     shutil.rmtree(Path(receipt.written), ignore_errors=True)
-    pipe.send("")
+    pipe.send(("", False))
 
 
 def _how(code: int | None) -> str:

@@ -20,11 +20,11 @@ from ..annotations import Template
 from ..errors import KinjaxError, OptionError
 from .catalogue import Entry, Part, find_clips, in_parts
 from .configuration import Configuration, TemplateRule, code_version
-from .engines import Engine, Lost, NoWorkers, make_engine
+from .engines import Engine, Lost, make_engine
 from .isolation import find_poison
 from .store import Store
 from .upkeep import finish_compaction
-from .work import Learnt, Receipt, Task, read_clip, skeleton_key
+from .work import JobFailed, Learnt, Receipt, Task, read_clip, skeleton_key
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ class _Job:
                     self._commit(task, outcome)
             rounds += 1
             if rounds > self.attempts and lost:
-                raise NoWorkers(f"part {lost[0].part.key} was lost {rounds} times, with no file of it to blame")
+                raise JobFailed(f"part {lost[0].part.key} was lost {rounds} times, with no file of it to blame")
             ready = [self._without_poison(t) for t in lost]
 
     def _without_poison(self, task: Task) -> Task:

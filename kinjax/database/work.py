@@ -81,8 +81,17 @@ def one_thread() -> None:
     pa.set_io_thread_count(1)
 
 
-def annotate_part(task: Task, begun: Callable[[str], object] | None = None) -> Receipt:
-    """Work on one part; begun: told the name of each clip before it is read."""
+class JobFailed(KinjaxError):
+    """The job as a whole cannot go on: no file of it is to blame. What is in the store stays."""
+
+
+COMPILING = 120.0
+"""Seconds more that a detection may take than a file: its program may have to be compiled first."""
+
+
+def annotate_part(task: Task, begun: Callable[[str, bool], object] | None = None) -> Receipt:
+    """Work on one part. begun: told the name of each clip before it is read (False), and before it is looked at (True): each
+    is then a batch of its own."""
     from .schema import Columns
 
     if task.cache is not None:
@@ -95,17 +104,13 @@ def annotate_part(task: Task, begun: Callable[[str], object] | None = None) -> R
             results.refuse(entry, known[0], known[1], attempts=known[2])
             continue
         if begun is not None:
-            begun(entry.clip)
-        try:
-            with time_limit(task.limit):
-                results.read(entry)
-        except OSError as error:
-            if error.filename is None or str(error.filename) != entry.path:
-                raise
-            results.refuse(entry, "unreadable", f"{entry.path}: {error.strerror or error}")
+            begun(entry.clip, False)
+        with time_limit(task.limit):
+            results.read(entry)
         if begun is not None:
-            results.flush()
-    results.flush()
+            begun(entry.clip, True)
+        results.detect(all=begun is not None)
+    results.detect(all=True)
     folder = Path(task.aside) / f"{task.part.key}-{secrets.token_hex(4)}"
     folder.mkdir()
     try:
@@ -161,8 +166,8 @@ class _Results:
         self.ok = self.bad = self.frames = 0
 
     def read(self, entry: Entry) -> None:
-        """Read a file; detect once a batch is full."""
-        from ..detect.batches import room_of, shape_of
+        """Read a file, or refuse it."""
+        from ..detect.batches import shape_of
 
         try:
             one = _prepare(entry, self.task)
@@ -170,23 +175,22 @@ class _Results:
             return self.refuse(entry, type(error).__name__, str(error), error.line, error.column)
         except KinjaxError as error:
             return self.refuse(entry, type(error).__name__, str(error))
-        except OSError:
-            raise
+        except OSError as error:
+            return self.refuse(entry, "unreadable", f"{entry.path}: {error.strerror or error}")
         except MemoryError:
             return self.refuse(entry, "MemoryError", f"{entry.path}: there is not enough memory for it")
         except Exception as error:  # a fault of ours must not cost a night's work: it is a row like the others
-            return self.refuse(entry, "fault", f"a fault of kinjax itself, {type(error).__name__}: {error}")
-        shape = (*shape_of(one.prepared), bool(one.patterns))
-        some = self.waiting.setdefault(shape, [])
-        some.append(one)
-        if len(some) >= room_of(one.prepared):
-            self._detect(self.waiting.pop(shape))
+            return self.refuse(entry, "fault", _fault(error))
+        self.waiting.setdefault((*shape_of(one.prepared), bool(one.patterns)), []).append(one)
 
-    def flush(self) -> None:
-        """Detect in what waits."""
-        while self.waiting:
-            with time_limit(self.task.limit):
-                self._detect(self.waiting.popitem()[1])
+    def detect(self, all: bool) -> None:
+        """Detect in batches that are full, or in all that wait."""
+        from ..detect.batches import room_of
+
+        limit = self.task.limit and self.task.limit + COMPILING
+        for shape in [s for s, some in self.waiting.items() if all or len(some) >= room_of(some[0].prepared)]:
+            with time_limit(limit):
+                self._detect(self.waiting.pop(shape))
 
     def refuse(
         self,
@@ -211,9 +215,11 @@ class _Results:
         settings = self.task.configuration.settings
         try:
             found = detect_prepared([r.prepared for r in some], settings, [r.patterns for r in some])
-        except KinjaxError as error:  # of one clip among several: each on its own tells which
+        except Exception as error:  # of one clip among several: each on its own tells which
             if len(some) == 1:
-                return self.refuse(some[0].entry, type(error).__name__, str(error))
+                known = isinstance(error, KinjaxError)
+                kind, text = (type(error).__name__, str(error)) if known else ("fault", _fault(error))
+                return self.refuse(some[0].entry, kind, text)
             for one in some:
                 self._detect([one])
             return
@@ -350,6 +356,10 @@ def _noise_warnings(found: Any, sources: Mapping[str, Learnt]) -> list[str]:
                     "thresholds learnt there may not fit"
                 )
     return out
+
+
+def _fault(error: Exception) -> str:
+    return f"a fault of kinjax itself, {type(error).__name__}: {error}"
 
 
 def _plain(value: Any) -> Any:

@@ -29,17 +29,18 @@ _PIECE = 1 << 17  # bytes at a time: the masks of a piece stay in the cache
 
 def read_numbers(raw: bytes, header: Header, channels: int, path: object = None) -> tuple[np.ndarray, list[str]]:
     """The numbers as (frames, channels), and notes on what was tolerated. `FileFormatError` as the module says."""
-    block, notes = raw[header.data_at :], []
+    at = header.data_at
+    if raw.find(b"#", at) < 0 and raw.find(b"/", at) < 0:
+        even = _parse_rows(raw, at, channels)
+        if even is not None and even.shape[1] in (header.frames, header.frames + 1) and np.isfinite(even).all():
+            more = [_one_more(header)] if even.shape[1] > header.frames else []
+            return even.T, more + ([] if raw[-1:].isspace() else _last_number(raw, raw[at:], header, channels, path))
+    block, notes = raw[at:], []
     if b"#" in block or b"/" in block:
         block, count = _COMMENT.subn(lambda m: b" " * len(m.group()), block)  # as long as before: places stay right
         notes += ["comments between the numbers were skipped"] if count else []
     if (len(block) + 1) // 2 < header.frames * channels:  # a number takes two bytes at least
         _wrong_count(raw, block, header, channels, path)
-    even_rows = _parse_rows(block, channels)
-    if even_rows is not None and even_rows.shape[1] in (header.frames, header.frames + 1) and np.isfinite(even_rows).all():
-        if even_rows.shape[1] > header.frames:
-            notes.append(_one_more(header))
-        return even_rows.T, notes + _last_number(raw, block, header, channels, path)
     values = _parse(block)
     if values is None:
         _bad_word(raw, block, header, path)
@@ -69,7 +70,7 @@ def _one_more(header: Header) -> str:
     return f"'Frames:' says {header.frames}, but {header.frames + 1} follow: all were read"
 
 
-def _parse_rows(block: bytes, channels: int) -> np.ndarray | None:
+def _parse_rows(raw: bytes, at: int, channels: int) -> np.ndarray | None:
     """(channels, frames), one row of memory a channel, if every line is a frame with one space between numbers, as most files
     are written; else None, and the slower way finds out. A line with a number too few or too many is refused by the parser."""
     import pyarrow as pa
@@ -78,11 +79,11 @@ def _parse_rows(block: bytes, channels: int) -> np.ndarray | None:
     if channels > _WIDE:
         return None
     names = [str(i) for i in range(channels)]
-    first = block[: 1 << 16].lstrip(b"\n").partition(b"\n")[0]
+    first = raw[at : at + (1 << 16)].lstrip(b"\n").partition(b"\n")[0]
     behind = ["behind"] if first.endswith(b" ") else []  # a space after the last number: an empty column
     try:
         table = csv.read_csv(
-            pa.py_buffer(block),
+            pa.py_buffer(memoryview(raw)[at:]),
             read_options=csv.ReadOptions(column_names=names + behind, block_size=max(1 << 18, 64 * channels)),
             parse_options=csv.ParseOptions(delimiter=" ", quote_char=False, ignore_empty_lines=True),
             convert_options=csv.ConvertOptions(
