@@ -171,12 +171,17 @@ def _bvh_hints(path: Path) -> tuple[str, ...]:
 
 
 def in_parts(entries: Iterable[Entry], configuration: str, clips: int = 64) -> list[Part]:
-    """Parts of about `clips` clips each: clips of one kind in the order of their names, cut behind a clip whose hash says so."""
+    """Parts of about `clips` clips each: clips of one kind in the order of their names, cut behind a clip whose hash says so.
+
+    The first part of every kind comes first, then the second of each: workers that begin together compile different programs,
+    and find each other's when they come to them.
+    """
     kinds: dict[tuple[str, ...], list[Entry]] = {}
     for e in sorted(entries, key=lambda e: e.clip):
         kinds.setdefault((e.root, *e.kind), []).append(e)
-    parts: list[Part] = []
+    rounds: dict[int, list[Part]] = {}
     for kind in sorted(kinds):
+        parts: list[Part] = []
         some: list[Entry] = []
         for e in kinds[kind]:
             some.append(e)
@@ -186,7 +191,9 @@ def in_parts(entries: Iterable[Entry], configuration: str, clips: int = 64) -> l
                 some = []
         if some:
             parts.append(_part(some, configuration))
-    return parts
+        for i, part in enumerate(parts):
+            rounds.setdefault(i, []).append(part)
+    return [part for i in sorted(rounds) for part in rounds[i]]
 
 
 def _part(entries: Sequence[Entry], configuration: str) -> Part:
