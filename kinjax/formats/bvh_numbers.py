@@ -31,10 +31,10 @@ def read_numbers(raw: bytes, header: Header, channels: int, path: object = None)
     """The numbers as (frames, channels), and notes on what was tolerated. `FileFormatError` as the module says."""
     at = header.data_at
     if raw.find(b"#", at) < 0 and raw.find(b"/", at) < 0:
-        even = _parse_rows(raw, at, channels)
-        if even is not None and even.shape[1] in (header.frames, header.frames + 1) and np.isfinite(even).all():
-            more = [_one_more(header)] if even.shape[1] > header.frames else []
-            return even.T, more + ([] if raw[-1:].isspace() else _last_number(raw, raw[at:], header, channels, path))
+        found = _parse_rows(raw, at, channels)
+        if found is not None and found.shape[1] in (header.frames, header.frames + 1) and np.isfinite(found).all():
+            more = [_one_more(header)] if found.shape[1] > header.frames else []
+            return found.T, more + ([] if raw[-1:].isspace() else _last_number(raw, raw[at:], header, channels, path))
     block, notes = raw[at:], []
     if b"#" in block or b"/" in block:
         block, count = _COMMENT.subn(lambda m: b" " * len(m.group()), block)  # as long as before: places stay right
