@@ -101,12 +101,15 @@ def _table(found: pa.Table, limit: int) -> None:
     right = [any(is_kind(f.type) for is_kind in kinds) for f in found.schema]
     rows.insert(0, [_cell(name, most) for name in found.schema.names])
     widths = [max(map(cell_len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        padded = (" " * (w - cell_len(x)) + x if r else x + " " * (w - cell_len(x)) for x, w, r in zip(row, widths, right, strict=True))
-        screen.print("  ".join(padded).rstrip())
+    screen.print("\n".join(_line(row, widths, right) for row in rows))
     rest = found.num_rows - shown.num_rows
     more = f", {rest:,} more: --limit 0 shows all" if rest else ""
     screen.print(f"{found.num_rows:,} row{'s' * (found.num_rows != 1)}{more}")
+
+
+def _line(row: Sequence[str], widths: Sequence[int], right: Sequence[bool]) -> str:
+    room = (" " * (w - cell_len(x)) for x, w in zip(row, widths, strict=True))
+    return "  ".join(r + x if at_right else x + r for x, r, at_right in zip(row, room, right, strict=True)).rstrip()
 
 
 def _cell(value: Any, most: int = sys.maxsize) -> str:
