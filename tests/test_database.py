@@ -142,6 +142,20 @@ def test_another_configuration_or_other_code_redoes_all(own, monkeypatch):
     assert Store(path).table("clips").num_rows == 12
 
 
+def test_the_papers_method_needs_templates(clips, tmp_path):
+    with pytest.raises(OptionError, match="templates"):
+        annotate([clips], tmp_path / "s", replace(FEET, settings=cases.Settings(method="paper")))
+
+
+def test_a_moved_database_is_annotated_where_it_is_now(own, tmp_path):
+    clips, path = own
+    (tmp_path / "deep").mkdir()
+    moved = clips.rename(tmp_path / "deep" / "clips")
+    annotate([moved], path, FEET, part_clips=4)
+    rows = Store(path).table("clips").to_pylist()
+    assert len(rows) == 12 and all(Path(r["path"]).is_file() and r["root"] == str(moved) for r in rows)
+
+
 def test_refused_files_are_tried_again_when_asked(own):
     clips, path = own
     assert annotate([clips], path, FEET, part_clips=4, retry=True).refused == 4
@@ -342,6 +356,9 @@ def test_a_template_is_carried_to_its_skeleton_or_subject(tmp_path):
         rows = Store(store).table("patterns").to_pylist()
         taught = [r for r in rows if r["template"] is not None]
         assert len(taught) == expected and {r["object"] for r in taught} == {"LeftFoot"}
+        assert sum(r["object"] == "RightFoot" and r["status"] == "automatic" for r in rows) == 4
+        by = {(r["clip"], r["pattern"]): r["object"] for r in rows}
+        assert all(by[r["clip"], r["pattern"]] == r["object"] for r in Store(store).table("constraints").to_pylist())
         assert all(r["template"].startswith("01_01.bvh LeftFoot") and r["status"] != "automatic" for r in taught)
         warned = [c["clip"] for c in Store(store).table("clips").to_pylist() if any("noise here" in w for w in c["warnings"])]
         assert warned == (["clips/02_02.bvh"] if scope != "subject" else [])
@@ -405,7 +422,6 @@ for = "subject"
         ("subject = '('", None, "regular expression"),
         ("subject = 'a'", None, "group"),
         ("objects = []", None, "objects"),
-        ('[settings]\nmethod = "paper"', None, "templates"),
     ],
 )
 def test_a_configuration_that_is_wrong_is_refused_with_its_line(text, line, says, tmp_path):
@@ -418,18 +434,18 @@ def test_a_configuration_that_is_wrong_is_refused_with_its_line(text, line, says
 
 def test_each_shape_compiles_once(tmp_path):
     from kinjax.detect.engine import run_clips
-    from kinjax.lengths import bucket
+    from kinjax.lengths import octave
 
     clips = tmp_path / "clips"
     clips.mkdir()
-    lengths = [40, 44, 48, 55, 60, 61, 70, 75, 80, 85, 90, 91, 92]
+    lengths = [30, 44, 48, 55, 60, 61, 70, 75, 80, 85, 90, 96, 97, 102]
     for n in lengths:
         save(clips / f"a_{n}.bvh", cases.walk().slice(0, min(n, cases.walk().frames) - 1))
     run_clips.clear_cache()
     annotate([clips], tmp_path / "s", FEET)
     frames = Store(tmp_path / "s").table("clips")["frames"].to_pylist()
     assert len(frames) == len(lengths)
-    assert run_clips._cache_size() <= len({bucket(n + 32) for n in frames}) <= 3
+    assert run_clips._cache_size() <= len({octave(n + 32) for n in frames}) <= 3
 
 
 def test_the_tables_open_elsewhere_as_they_are(annotated):

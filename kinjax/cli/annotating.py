@@ -25,6 +25,7 @@ from .database_options import Annotate
 from .show import Screen, table
 
 FAILED = 1
+SUFFIXES = "|".join(map(re.escape, motion_suffixes()))
 
 
 def annotate_command(options: Annotate) -> int:
@@ -89,11 +90,13 @@ def _configuration(options: Annotate) -> Configuration:
 
 
 def _template(text: str, carry: Any) -> TemplateRule:
-    """A template of `CLIP:NAME=BEGIN:END[:TYPE]`; the clip's path may hold colons."""
-    found = re.fullmatch(r"(.+):([^:=]+)=(\d+):(\d+)(?::(\w+))?", text)
-    if found is None:
+    """A template of `CLIP:NAME=BEGIN:END[:TYPE]`; the clip's path may hold colons, and the name of a joint too."""
+    found = re.fullmatch(r"(.+)=(\d+):(\d+)(?::(\w+))?", text)
+    named = None if found is None else re.fullmatch(rf"(.+?(?:{SUFFIXES})):(.+)|(.+):([^:]+)", found[1], re.IGNORECASE)
+    if found is None or named is None:
         raise OptionError(f"--template {text!r}: write CLIP:NAME=BEGIN:END or CLIP:NAME=BEGIN:END:TYPE, frames from 0")
-    clip, name, begin, end, kind = found.groups()
+    clip, name = (part for part in named.groups() if part is not None)
+    _, begin, end, kind = found.groups()
     return TemplateRule(clip, name, int(begin), int(end), check_type(kind or "space"), carry)
 
 

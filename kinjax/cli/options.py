@@ -28,7 +28,7 @@ class Reading:
     """How motion files are read."""
 
     unit: Annotated[str, _opt(metavar="UNIT", default="auto: from the skeleton's height")] = "auto"
-    """Unit of the file's lengths: m, cm, mm, inch, foot, or metres per unit."""
+    """Unit of the file's lengths: m, cm, mm, inch, cmu, or metres per unit."""
     up: Annotated[Literal["x", "y", "z"] | None, _opt(metavar="{x,y,z}", default="the file's, y for BVH")] = None
     """The world's up axis."""
 

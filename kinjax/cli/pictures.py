@@ -34,6 +34,8 @@ def plot_command(options: Plot) -> int:
     span = _span(options.frames)
     with screen.busy() as busy:
         kept = annotations_in(source)
+        if kept is not None and span is not None:
+            raise OptionError("--frames goes with a clip: annotations alone are drawn whole")
         if kept is not None:
             from ..plots import timeline
 

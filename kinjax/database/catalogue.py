@@ -43,7 +43,8 @@ class Entry:
 
     def key(self, configuration: str) -> str:
         """Names the annotation of this file, as it is now, under a configuration."""
-        return hashlib.sha256("\0".join((self.clip, self.stamp, configuration)).encode()).hexdigest()[:20]
+        text = "\0".join((self.clip, self.path, self.stamp, configuration))
+        return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:20]
 
 
 @dataclass(frozen=True)

@@ -73,8 +73,6 @@ class Configuration:
             raise OptionError(f"subject={self.subject!r} is no regular expression: {error}") from None
         if not groups:
             raise OptionError(f"subject={self.subject!r} needs a group in parentheses: what it matches is the subject")
-        if self.settings.method == "paper" and not (self.templates or self.settings.thresholds):
-            raise OptionError('method="paper" needs templates, or thresholds=(sigma_max, eps_max)')
 
     def document(self) -> dict[str, Any]:
         """All of it as plain values, for the manifest."""

@@ -86,6 +86,8 @@ def annotate(
     if timeout <= 0 or attempts < 1 or part_clips < 1:
         raise OptionError("timeout must be positive, attempts and part_clips at least one")
     configuration = configuration or Configuration()
+    if configuration.settings.method == "paper" and not (configuration.templates or configuration.settings.thresholds):
+        raise OptionError('method="paper" needs templates, or thresholds=(sigma_max, eps_max)')
     say = progress or (lambda p: None)
     start = make_engine(engine) if isinstance(engine, str) else engine
     target = Path(os.path.abspath(store))

@@ -81,9 +81,9 @@ class Store:
         """One part of a table."""
         path = self.file(table, part)
         try:
-            with pq.ParquetFile(path, memory_map=False) as f:
+            with pq.ParquetFile(path, memory_map=False, page_checksum_verification=True) as f:
                 return f.read(columns=columns)
-        except (pa.ArrowInvalid, FileNotFoundError) as error:
+        except (pa.ArrowException, OSError) as error:
             remedy = "`kinjax store check` tells what is wrong; annotating again makes the part anew"
             raise FileFormatError(f"this part cannot be read: {error}", path=path, remedy=remedy) from error
 
@@ -177,8 +177,8 @@ class Store:
             try:
                 tables = [self.part(t, part, ["clip", "key"]) for t in SETTLED]
                 for t in TABLES:
-                    pq.read_metadata(self.file(t, part))
-            except (FileFormatError, pa.ArrowInvalid, OSError):
+                    self.part(t, part)
+            except FileFormatError:
                 self.remove([part])
                 continue
             for t in tables:
@@ -230,6 +230,6 @@ def write_tables(tables: Mapping[str, pa.Table], folder: Path) -> None:
     """The four tables as files in a folder, on disk when this returns; equal tables give equal bytes."""
     for name, schema in TABLES.items():
         with open(folder / f"{name}.parquet", "xb") as f:
-            pq.write_table(tables[name].cast(schema), f, compression="zstd")
+            pq.write_table(tables[name].cast(schema), f, compression="zstd", write_page_checksum=True)
             f.flush()
             os.fsync(f.fileno())

@@ -60,7 +60,13 @@ def detection(
     slot, lane = np.nonzero(host.kind[:, :objects])
     scale = clip.original_rate / clip.rate
     frame = lambda x: np.minimum(np.floor(x * scale + 0.5).astype(int), clip.original_frames - 1)  # noqa: E731
-    records = list(patterns) or list(pattern_records(clip, settings, plan, host, templates))
+    records = list(patterns)
+    given = {(p.object.casefold(), p.type == "space") for p in records}
+    records += [
+        p
+        for p in pattern_records(clip, settings, plan, host, templates)
+        if (p.object.casefold(), p.type == "space") not in given
+    ]
     kind = host.kind[slot, lane]
     index: dict[tuple[str, str], int] = {
         (p.object.casefold(), p.type): i for i, p in reversed(list(enumerate(records)))
