@@ -189,9 +189,8 @@ def window_stage() -> None:
     clip = Clip(*map(jnp.asarray, prepared(poses, None, None, Settings()).arrays))
     shortest, longest = 7, 48
     count = clip.valid.size * (longest - shortest + 1)
-    reward = Reward(
-        jnp.float32(4), jnp.full(4, 3e-3, jnp.float32), jnp.float32(28), jnp.float32(0.2), jnp.float32(1.8e-4)
-    )
+    nu, near, turn = (jnp.full(4, x, jnp.float32) for x in (3e-3, 2e-3, 1e-2))
+    reward = Reward(jnp.float32(4), nu, jnp.float32(28), jnp.float32(0.2), jnp.float32(1.8e-4), near, turn)
     score = jax.jit(lambda c: window_rewards(*c, ~c.valid, shortest, longest, reward, rest=False))
     both = jax.jit(
         lambda c: best_segmentation(window_rewards(*c, ~c.valid, shortest, longest, reward, rest=False), shortest)

@@ -30,6 +30,9 @@ from .settling import Poses, settle
 from .sigma_epsilon import SigmaEpsilon, project, project_by_svd
 from .windows import Reward, best_segmentation, window_rewards
 
+REST_NOISE = 0.003
+"""Metres: the least noise that a rest is measured against (window method)."""
+
 
 def run(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, given: tuple[Pattern, ...]) -> Found:
     """Steps 1 to 6."""
@@ -77,17 +80,20 @@ def run(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, give
             plan.mean + (plan.span + 1) // 2,
         )
     found, overflow = _refit(plan, numbers, spans, clip), total
-    pivot_noise = jnp.maximum(numbers.pivot_noise, nu[0])
+    pivot_noise = jnp.maximum(numbers.pivot_noise, jnp.maximum(numbers.pivot_floor, nu[0]))
     if plan.lines and not paper:
+        taught = numbers.pivot_noise
         if plan.templates:
-            pivot_noise = jnp.maximum(pivot_noise, template_noise(*clip, *templates[1]))
+            taught = jnp.maximum(taught, template_noise(*clip, *templates[1]))
+        pivot_noise = jnp.maximum(pivot_noise, taught)
         long = (spans.last - spans.first) >= numbers.least
         space = jnp.where(long, spans.kind, NONE), spans.first, spans.last
         pivots, more = merged_pivots(
             *clip,
             space,
-            pivot_noise,
-            nu[1],
+            taught,
+            numbers.pivot_floor,
+            nu,
             plan.pivot,
             plan.free_pivots,
             plan.capacity,
@@ -221,15 +227,17 @@ def _rest_windows(
     """
     dtype = clip.t.dtype
     beta = jnp.asarray(9.0, dtype)
-    noise_level = jnp.maximum(numbers.pivot_noise, jnp.hypot(nu[0], jnp.asarray(0.1 * (2 / 3) ** 0.5, dtype) * nu[1]))
+    least = jnp.maximum(numbers.pivot_noise, jnp.asarray(REST_NOISE, dtype))
+    noise_level = jnp.maximum(least, jnp.hypot(nu[0], jnp.asarray(0.1 * (2 / 3) ** 0.5, dtype) * nu[1]))
     if plan.templates:
         spread = jax.vmap(
             lambda q, t, v, s: noise.template_spread(q, t, v, s, plan.template_frames), in_axes=(1, 1, 0, 0)
         )
         # a template that creeps must not pass for noise: no more than twice the least, as the robust method's cap
-        taught = jnp.minimum(spread(*clip, templates[0]), numbers.pivot_noise + numbers.pivot_noise)
+        taught = jnp.minimum(spread(*clip, templates[0]), least + least)
         noise_level = jnp.maximum(noise_level, taught)
-    reward = Reward(beta, noise_level, beta * jnp.asarray(0.06, dtype) * numbers.rate, numbers.pivot_reach, beta * 0)
+    opening, none = beta * jnp.asarray(0.06, dtype) * numbers.rate, noise_level * 0
+    reward = Reward(beta, noise_level, opening, numbers.pivot_reach, beta * 0, none, none)
     nothing = jnp.zeros_like(clip.valid)
     windows = best_segmentation(window_rewards(*clip, nothing, *plan.rest, reward, rest=True), plan.rest[0])
     kind = jnp.where(windows.inside, SPACE, NONE)

@@ -55,6 +55,7 @@ class Numbers(NamedTuple):
     axis_min: Float[Array, ""]
     spike: Float[Array, ""]
     pivot_noise: Float[Array, " objects"]
+    pivot_floor: Float[Array, ""]
     pivot_reach: Float[Array, ""]
     least: Int[Array, ""]
     tolerance: Tolerance

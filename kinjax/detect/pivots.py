@@ -39,8 +39,9 @@ def merged_pivots(
     t: Float[Array, "3 objects frames"],
     valid: Bool[Array, "objects frames"],
     space: tuple[Int[Array, "slots objects"], ...],
-    noise: Float[Array, " objects"],
-    turn_noise: Float[Array, " objects"],
+    taught: Float[Array, " objects"],
+    floor: Float[Array, ""],
+    noise: tuple[Float[Array, " objects"], Float[Array, " objects"]],
     lengths: tuple[int, int],
     free: bool,
     capacity: int,
@@ -50,12 +51,20 @@ def merged_pivots(
 ) -> tuple[Constraintlike, Int[Array, " objects"]]:
     """Pivots of every object, and how many windows there were (more than `capacity`: repeat with more).
 
-    space: kind, begin, end of what is at rest. noise: metres that a pivot is measured against; turn_noise: rotational
-    noise, rad. line_below: eigenvalue of `M` under which an axis is one.
+    space: kind, begin, end of what is at rest. taught: metres that templates and patterns leave, 0 without any. floor: metres
+    that a real body's pivot wanders. noise: of the data, metres and radians; at lever `p` it moves a pivot by
+    `sqrt(noise[0]^2 + 2/3 (noise[1] |p|)^2)`. line_below: eigenvalue of `M` under which an axis is one.
     """
     dtype = t.dtype
+    place_noise, turn_noise = noise
     reward = Reward(
-        jnp.asarray(BETA, dtype), noise, jnp.asarray(BETA * OPENING, dtype) * rate, reach, jnp.asarray(RIDGE, dtype)
+        jnp.asarray(BETA, dtype),
+        taught,
+        jnp.asarray(BETA * OPENING, dtype) * rate,
+        reach,
+        jnp.asarray(RIDGE, dtype),
+        jnp.hypot(floor, place_noise),
+        jnp.asarray((2 / 3) ** 0.5, dtype) * turn_noise,  # `noise[1]` is summed over three axes, of which two move a point
     )
     resting = _inside(space, valid.shape[-1])
     rewards = window_rewards(q, t, valid, resting, *lengths, reward, rest=False)
@@ -119,8 +128,9 @@ def _merged(
 
     def earned(x: Moments) -> Array:
         energy, p = pivot_energy(quadratic(x), reward.ridge)
-        near = dot(p, p) <= reward.reach**2
-        return jnp.where(near, x.n * (reward.beta - energy / reward.nu**2) - reward.opening, -jnp.inf)
+        square = dot(p, p)
+        earns = x.n * (reward.beta - energy / reward.level(square)) - reward.opening
+        return jnp.where(square <= reward.reach**2, earns, -jnp.inf)
 
     def step(open_: tuple, new: tuple) -> tuple[tuple, tuple]:
         is_open, o_first, o_last, o_origin, o_moments, o_earned = open_

@@ -47,7 +47,7 @@ def widths(settings: Settings, rate: float) -> dict[str, int | tuple[int, int]]:
 
 
 def numbers(settings: Settings, rate: float, pivot_noise: np.ndarray) -> Numbers:
-    """Settings that are data, as arrays; `pivot_noise` (lanes,) in metres by object."""
+    """Settings that are data, as arrays; `pivot_noise` (lanes,) is what patterns say, metres by object."""
     dtype = working_dtype()
     f: Any = lambda x: np.asarray(x, dtype)  # noqa: E731  (NumPy: eighteen small transfers cost more than they hold)
     count: Any = lambda s, least=0: np.asarray(max(least, int(np.floor(s * rate + 0.5))), np.int32)  # noqa: E731
@@ -61,7 +61,8 @@ def numbers(settings: Settings, rate: float, pivot_noise: np.ndarray) -> Numbers
         f(settings.margin),
         f(settings.axis_min),
         f(settings.spike),
-        f(np.maximum(pivot_noise, settings.pivot_noise)),
+        f(pivot_noise),
+        f(settings.pivot_noise),
         f(settings.pivot_reach),
         count(settings.min_duration, 1),
         Tolerance(

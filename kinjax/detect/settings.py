@@ -45,7 +45,7 @@ class Settings:
     hampel, spike: half width of the running median in seconds, and the least outlier that it removes in metres.
     free_pivots: keep line and point constraints that touch no space constraint (hinges, doors, dice).
     pivot_window, pivot_reach: (shortest, longest) window in seconds, and the greatest distance of a pivot from the object.
-    pivot_noise: the least noise in metres that a pivot is measured against.
+    pivot_noise: metres that a pivot of a real body wanders, besides the noise of the data.
     """
 
     types: tuple[ConstraintType, ...] = ("space",)
@@ -74,7 +74,7 @@ class Settings:
     free_pivots: bool = False
     pivot_window: tuple[float, float] = (0.06, 0.4)
     pivot_reach: float = 0.2
-    pivot_noise: float = 0.003
+    pivot_noise: float = 0.002
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "types", tuple(dict.fromkeys(check_type(t) for t in self.types)))

@@ -21,13 +21,22 @@ from .refit import Moments, pivot_energy, quadratic
 
 class Reward(NamedTuple):
     """What a window earns: `beta`, the noise `nu` (objects,) in metres, the `opening` cost, the `reach` of a pivot in
-    metres, and the `ridge` on `M` ((2 mm / 15 cm)^2: a pivot is known to 2 mm where a lever of 15 cm moves)."""
+    metres, and the `ridge` on `M` ((2 mm / 15 cm)^2: a pivot is known to 2 mm where a lever of 15 cm moves).
+
+    A pivot `p` is measured against `level`: no less than `nu`, nor than `sqrt(near^2 + (turn |p|)^2)`, as noise of rotation moves
+    it more the farther it is from the origin; `near` (objects,) metres, `turn` (objects,) radians."""
 
     beta: Float[Array, ""]
     nu: Float[Array, " objects"]
     opening: Float[Array, ""]
     reach: Float[Array, ""]
     ridge: Float[Array, ""]
+    near: Float[Array, " objects"]
+    turn: Float[Array, " objects"]
+
+    def level(self, square: Float[Array, "*rows objects"]) -> Float[Array, "*rows objects"]:
+        """Squared metres that pivots are measured against, by their squared distance from the origin."""
+        return jnp.maximum(self.nu**2, self.near**2 + self.turn**2 * square)
 
 
 class Windows(NamedTuple):
@@ -54,7 +63,7 @@ def window_rewards(
     pivots farther from the object's origin than `reach`. rest: reward rest (`E = c + (r^2/3) tr M`, r = 0.1 m), not a pivot.
     """
     frames = valid.shape[-1]
-    nu2 = (reward.nu**2)[:, None]
+    columns = reward._replace(nu=reward.nu[:, None], near=reward.near[:, None], turn=reward.turn[:, None])
     pad = [(0, 0)] * (t.ndim - 1) + [(0, longest)]
     weight = valid.astype(t.dtype)
     rows = jnp.concatenate(
@@ -74,11 +83,12 @@ def window_rewards(
         e = quadratic(moments)
         if rest:
             energy = e.c + jnp.asarray(0.01 / 3, t.dtype) * (e.m[0, 0] + e.m[1, 1] + e.m[2, 2])
-            near = jnp.ones_like(valid)
+            near, level = jnp.ones_like(valid), columns.nu**2
         else:
             energy, p = pivot_energy(e, reward.ridge)
-            near = dot(p, p) <= reward.reach**2
-        earned = moments.n * (reward.beta - energy / nu2) - reward.opening
+            square = dot(p, p)
+            near, level = square <= reward.reach**2, columns.level(square)
+        earned = moments.n * (reward.beta - energy / level) - reward.opening
         allowed = near & start_ok & (w > 0) & (stopped == 0) & (at + length <= frames)
         return (moments, stopped), jnp.where(allowed, earned, -jnp.inf)
 
