@@ -275,7 +275,7 @@ def test_a_pivot_is_measured_against_the_noise_at_its_lever():
     from kinjax.detect.windows import Reward, window_rewards
 
     rng = np.random.default_rng(3)
-    frames, ridge, beta, opening, reach, nu, near, turn = 30, 1e-4, 4.0, 20.0, 0.2, 0.0055, 0.002, 0.05
+    frames, ridge, beta, opening, reach, nu, near, turn = 30, 1e-4, 4.0, 20.0, 0.2, 0.0065, 0.002, 0.05
     turned = Rotation.from_rotvec(np.cumsum(rng.normal(scale=0.06, size=(frames, 3)), 0))
     R = turned.as_matrix()
     t = np.array([1.0, 2.0, 3.0]) - R @ np.array([0.12, 0.02, -0.05]) + rng.normal(scale=0.002, size=(frames, 3))

@@ -19,6 +19,7 @@ from ..database.engines import make_engine
 from ..database.job import Progress, Report, annotate
 from ..database.work import JobFailed
 from ..errors import KinjaxError, OptionError
+from ..formats import motion_suffixes
 from .assignments import changed_settings
 from .cache import cache_folder
 from .database_options import Annotate
