@@ -24,9 +24,9 @@ DETECT = (
     "merging",
 )  # fmt: skip
 DEFORM = (
-    "constraints", "settings", "results", "prioritized", "chain", "tasks", "frame_solver", "sequence", "kochanek_bartels",
+    "constraints", "settings", "results", "prioritized", "chain", "tasks", "loops", "frame_solver", "sequence", "kochanek_bartels",
     "shape", "recruiting", "filtering", "targets", "balance", "body", "resolving", "layout", "plan", "reuse", "solving",
-    "reporting", "pipeline", "comparison", "cleaning",
+    "reporting", "pipeline", "comparison", "cleaning", "conditions", "implicit", "arrangement", "bending",
 )  # fmt: skip
 STRANGERS = ({"detect", "deform"}, {"studio", "cli"}, {"plots", "database"})
 CLI = (

@@ -4,6 +4,8 @@ In: a `Motion` and constraints. Out: `Deformation`, the new motion and a report.
 edit, `deform_many` takes several clips at once.
 """
 
+from .arrangement import Variables
+from .bending import Bend, Bent
 from .cleaning import clean, constraints_from
 from .comparison import least_squares
 from .constraints import CenterOfMass, Goal, LookAt, Orientation, Position, Through
@@ -13,6 +15,8 @@ from .settings import Settings
 
 __all__ = [
     "STATUSES",
+    "Bend",
+    "Bent",
     "CenterOfMass",
     "Deformation",
     "Goal",
@@ -22,6 +26,7 @@ __all__ = [
     "Report",
     "Settings",
     "Through",
+    "Variables",
     "clean",
     "constraints_from",
     "deform",

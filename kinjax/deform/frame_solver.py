@@ -26,6 +26,7 @@ from ..numerics import safe_divide, safe_sqrt
 from ..rotations import log
 from .chain import Chain, Pose, World, compose, forward, inverse_of, moved, parent_rotations
 from .prioritized import factorize, layered_step, outside, times
+from .loops import Loop, plain
 from .tasks import CENTER_OF_MASS, Goals, Kinds, Tasks, jacobian, look, residuals
 
 PULLS = (1.0, 0.25)
@@ -129,11 +130,12 @@ def solve_frame(
     trust: Float[Array, " layers"],
     pull: Float[Array, ""],
     drag: Float[Array, ""] | float = 1.0,
+    loop: Loop = plain,
 ) -> State:
     """Iterate from `start` until nothing is gained, `solving.iterations` times at most in each run. drag: 0 for a frame that has
-    none before it, from which to move smoothly."""
+    none before it, from which to move smoothly. loop: how loops are run (`loops`)."""
     solving = solving._replace(drag=solving.drag * drag)
-    step = _Iteration(chain, tasks, goals, offsets, reference, layers, solving, kinds)
+    step = _Iteration(chain, tasks, goals, offsets, reference, layers, solving, kinds, loop)
     first = step.begin(start, trust, pull)
     # layers below the last active one are not there
     every = 1 + jnp.max(jnp.where(goals.active > 0, tasks.layer, -1)).astype(jnp.int32)
@@ -141,7 +143,7 @@ def solve_frame(
     low = jnp.arange(layers, dtype=jnp.int32)
 
     def run(a: Attempt) -> Attempt:
-        end = jax.lax.while_loop(
+        end = loop(
             lambda s: (s.iterations < solving.iterations) & ~s.done, lambda s: step.iterate(s, a.depth, a.caps), a.now
         )
         # 0: all layers; then for depth 1, 2, ...: from the start, and from `upper` where that one broke the caps
@@ -165,7 +167,7 @@ def solve_frame(
 
     none = jnp.zeros((), bool)
     attempt = Attempt(first, every, free, first, first, none, jnp.zeros((), jnp.int32), none)
-    return jax.lax.while_loop(lambda a: ~a.over, run, attempt).now
+    return loop(lambda a: ~a.over, run, attempt).now
 
 
 def _select(which: Bool[Array, ""], a: State, b: State) -> State:
@@ -175,7 +177,8 @@ def _select(which: Bool[Array, ""], a: State, b: State) -> State:
 class _Iteration:
     """The iteration of one frame: everything that does not change while it runs."""
 
-    def __init__(self, chain, tasks, goals, offsets, reference, layers, solving, kinds):
+    def __init__(self, chain, tasks, goals, offsets, reference, layers, solving, kinds, loop):
+        self.loop = loop
         self.chain, self.tasks, self.goals, self.offsets = chain, tasks, goals, offsets
         self.reference, self.layers, self.solving, self.kinds = reference, layers, solving, kinds
         self.rows = jnp.repeat(tasks.layer, 3)
@@ -261,7 +264,7 @@ class _Iteration:
         spread = jax.tree.map(lambda x: jnp.repeat(x, layers + pulls, axis=-1), (s.pose, s.world))
         zero = jnp.zeros((), jnp.int32)
         none = Tried(y[:, None] * use, spread[0], spread[1], expected, s.errors[:, None] + 0 * posture, zero, zero)
-        along, trial, world, r, errors, best, _ = jax.lax.while_loop(unsettled, attempt, none)
+        along, trial, world, r, errors, best, _ = self.loop(unsettled, attempt, none)
         step = times(across.T, along) + z[:, None] * posture[None, :]
         everything = jnp.concatenate([errors, s.errors[:, None]], axis=1)
         stay = best == layers + pulls

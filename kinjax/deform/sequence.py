@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .chain import Chain, Pose, compose, inverse_of
 from .frame_solver import Reference, Solving, solve_frame
+from .loops import Loop, plain
 from .tasks import Goals, Kinds, Tasks
 
 
@@ -79,11 +80,13 @@ def solve_sequence(
     layers: int,
     kinds: Kinds,
     attract: tuple[bool, bool] = (True, True),
+    loop: Loop = plain,
 ) -> tuple[Carried, Solved]:
     """All frames in their order, from the pose `first` (C = 1); gives the last pose, too.
 
     attract: whether joints, and the root's translation, are drawn to the input. A frame whose solve is not finite restarts
     from the input and is flagged; where the input itself is not finite, the next frame starts from the last sound one.
+    loop: how a frame's loops are run (`loops`).
     """
 
     def step(carried: Carried, x: Frames) -> tuple[Carried, Solved]:
@@ -97,7 +100,7 @@ def solve_sequence(
             float(attract[1]) * x.root_controlled * x.goals.root_free,
         )
         s = solve_frame(
-            chain, tasks, x.goals, start, x.offsets, reference, layers, solving, kinds, trust, pull, x.dragged
+            chain, tasks, x.goals, start, x.offsets, reference, layers, solving, kinds, trust, pull, x.dragged, loop
         )
         sound = jnp.isfinite(s.pose.rotations).all() & jnp.isfinite(s.pose.root).all() & jnp.isfinite(s.errors).all()
         pose = Pose(

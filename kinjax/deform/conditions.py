@@ -1,0 +1,193 @@
+"""What holds at a solved frame, as equations: from them follow the derivatives of the pose that the solver found.
+
+In: a frame's pose, what was asked of it, where it started. Out: `balance`, n numbers that are 0 where no layer can gain anything
+with what the layers above leave it and the attraction cannot either: the conditions of the lexicographic optimum, one set a
+layer. For layer `i`, with `r_i` its residuals and `J_i` its rows: `J_i' r_i` lies in the span of the rows above, and what
+remains outside all rows of the attraction `z` (eq. 1 of the 2004 paper) is 0.
+
+They are written with multipliers, `J_i' r_i - J_above' mu_i`, so that their derivative holds the curvature of the
+constraints; the row basis, the multipliers and the inverses, which `prioritized` makes as in the solve, are `Factors` and
+count as constant. The numbers are steps, in radians and metres along world axes: the derivative of `balance` by the pose is
+minus the identity plus that curvature.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ..numerics import safe_divide, safe_sqrt
+from .chain import Chain, Pose, forward, moved, parent_rotations
+from .frame_solver import Reference, attraction
+from .prioritized import Basis, inverse, row_basis, times
+from .sequence import Frames, displaced
+from .tasks import CENTER_OF_MASS, Kinds, Tasks, jacobian, look, residuals
+
+FAINT = 0.02
+"""Directions in which a layer moves less than this share of its rows' root mean square length are held back: there the
+derivative would grow without bound. Those that move five times as much are left as they are to within rounding."""
+
+
+class Solved(NamedTuple):
+    """A frame's place in the clip: its `pose`, and the pose and the input's pose of the frame `before` it (C = 1)."""
+
+    pose: Pose
+    last: Pose
+    before: Pose
+
+
+class Numbers(NamedTuple):
+    """The solver's numbers that decide where it rests: `drag` and `singular` (`settings.Settings`), and whether joints and the
+    root's translation are `attracted` to the input (0 or 1) or stay where the frame started."""
+
+    drag: Float[Array, ""]
+    singular: Float[Array, ""]
+    attracted: tuple[Float[Array, ""], Float[Array, ""]]
+
+
+class Factors(NamedTuple):
+    """The constants of one frame's conditions.
+
+    basis: of all rows. solve: (m, m) `(R_ii' R_ii + hold_i)^-1` in blocks of layers. hold: (m, m) what keeps a layer back:
+    the drag of the lowest one, and along faint directions. dragged: (m, m) the drag's share of it. multipliers: (N + 1, m)
+    those of each layer's conditions and, last, those of the attraction.
+    """
+
+    basis: Basis
+    solve: Float[Array, "m m"]
+    hold: Float[Array, "m m"]
+    dragged: Float[Array, "m m"]
+    multipliers: Float[Array, "layers1 m"]
+
+
+def factors_of(
+    chain: Chain, tasks: Tasks, frame: Frames, at: Solved, numbers: Numbers, layers: int, kinds: Kinds
+) -> Factors:
+    """The constants at a pose."""
+    r, jac, pull, _ = _asked(chain, tasks, frame, at, numbers, kinds)
+    basis = row_basis(jac)
+    rows = jnp.repeat(tasks.layer, 3)
+    same = (rows[:, None] == rows[None, :]).astype(jac.dtype)
+    own = basis.factors * same
+    normal = times(own.T, own)
+    square = jnp.sum(jac * jac, axis=1)
+    counted = times(same, (square > 0).astype(jac.dtype))
+    size2 = safe_divide(times(same, square), counted)
+    size2 = jnp.where(size2 > 0, size2, jnp.ones_like(size2))
+    held = (rows == _lowest(tasks, frame)) & (jnp.repeat(tasks.kind, 3) != CENTER_OF_MASS)
+    strength = jnp.where(held, numbers.drag * frame.dragged, jnp.zeros_like(size2))
+    dragged = _faint(normal, numbers.singular**2 * size2, strength)
+    hold = dragged + _faint(normal, FAINT**2 * size2, FAINT * safe_sqrt(size2))
+    empty = (jnp.sum(basis.rows**2, axis=1) < 0.5).astype(jac.dtype)  # a row that adds no direction
+    solve = inverse(normal + hold + jnp.diag(empty * size2))
+    goals = r[:, None] * _members(rows, layers, r.dtype)
+    sought = jnp.concatenate([times(basis.factors.T, goals), times(basis.rows, pull)[:, None]], axis=1)
+    above = rows[:, None] < jnp.arange(layers + 1, dtype=jnp.int32)[None, :]
+    return Factors(basis, solve, hold, dragged, _multipliers(basis.factors, jnp.where(above, sought, 0), jac).T)
+
+
+def balance(
+    chain: Chain,
+    tasks: Tasks,
+    frame: Frames,
+    at: Solved,
+    factors: Factors,
+    numbers: Numbers,
+    layers: int,
+    kinds: Kinds,
+) -> Float[Array, " n"]:
+    """The conditions: 0 at a pose where nothing can be gained, else about the step that is missing."""
+    r, jac, pull, travel = _asked(chain, tasks, frame, at, numbers, kinds)
+    rows = jnp.repeat(tasks.layer, 3)
+    q = factors.basis.rows
+    member = _members(rows, layers, r.dtype)
+    asked = jnp.concatenate([r[:, None] * member, jnp.zeros_like(r[:, None])], axis=1) - factors.multipliers.T
+    gains = times(jac.T, asked)  # (n, N + 1)
+    own = jnp.sum(times(q, gains[:, :layers]) * member, axis=1)
+    y = times(factors.solve, own - times(factors.dragged, times(q, travel)))
+    free = pull + gains[:, layers]
+    return times(q.T, y - times(q, free)) + free
+
+
+def derivative(
+    chain: Chain,
+    tasks: Tasks,
+    frame: Frames,
+    at: Solved,
+    factors: Factors,
+    numbers: Numbers,
+    layers: int,
+    kinds: Kinds,
+) -> Float[Array, "n n"]:
+    """How `balance` changes with a step of the pose, along world axes; along faint directions it counts as if they moved."""
+    parent = parent_rotations(chain, forward(chain, at.pose, frame.offsets))
+    free = chain._replace(limits=None)
+
+    def after(step: Float[Array, " n"]) -> Float[Array, " n"]:
+        pose = moved(free, at.pose, parent, step[:, None])
+        return balance(chain, tasks, frame, at._replace(pose=pose), factors, numbers, layers, kinds)
+
+    q = factors.basis.rows
+    faint = times(factors.solve, times(factors.hold - factors.dragged, q))
+    return jax.jacfwd(after)(jnp.zeros(3 + 3 * parent.shape[0], parent.dtype)) - times(q.T, faint)
+
+
+def _asked(
+    chain: Chain, tasks: Tasks, frame: Frames, at: Solved, numbers: Numbers, kinds: Kinds
+) -> tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " n"], Float[Array, " n"]]:
+    """Residuals, Jacobian, where the pose is drawn to when no row minds, and how far it has come from its start."""
+    world = forward(chain, at.pose, frame.offsets)
+    seen = look(tasks, frame.goals, world)
+    r = residuals(tasks, frame.goals, seen, kinds).reshape(-1)
+    jac = jacobian(chain, tasks, frame.goals, world, seen, kinds)
+    parent = parent_rotations(chain, world)
+    own = Pose(frame.rotations[..., None], frame.root[:, None])
+    turning = frame.controlled * frame.warm
+    sliding = frame.root_controlled * frame.warm * frame.goals.root_free
+    start = displaced(own, at.last, at.before, turning, sliding)
+    # a joint that is not controlled is the input's; one that is and is not attracted stays where it started
+    stays = (1 - numbers.attracted[0]) * frame.controlled
+    stays_root = (1 - numbers.attracted[1]) * frame.root_controlled
+    to_input = attraction(Reference(frame.rotations, frame.root, 1 - stays, 1 - stays_root), at.pose, parent)
+    to_start = attraction(Reference(start.rotations[..., 0], start.root[:, 0], stays, stays_root), at.pose, parent)
+    every = Reference(start.rotations[..., 0], start.root[:, 0], jnp.ones_like(stays), jnp.ones_like(stays_root))
+    return r, jac, to_input + to_start, -attraction(every, at.pose, parent)
+
+
+def _members(rows: Int[Array, " m"], layers: int, dtype: jnp.dtype) -> Float[Array, "m layers"]:
+    """1 where a row is of a layer."""
+    return (rows[:, None] == jnp.arange(layers, dtype=jnp.int32)).astype(dtype)
+
+
+def _lowest(tasks: Tasks, frame: Frames) -> Int[Array, ""]:
+    """The last layer of which something is asked in this frame."""
+    return jnp.max(jnp.where(frame.goals.active > 0, tasks.layer, -1))
+
+
+def _faint(normal: Float[Array, "m m"], sigma2: Float[Array, " m"], strength: Float[Array, " m"]) -> Float[Array, "m m"]:
+    """`strength^2 / (1 + (s / sigma)^2)^8` along each singular direction of the layers' own rows, `normal` being R_ii' R_ii."""
+    fade = inverse(jnp.eye(len(sigma2), dtype=normal.dtype) + normal / safe_sqrt(sigma2[:, None] * sigma2[None, :]))
+    fade = times(fade, fade)
+    fade = times(fade, fade)
+    return strength[:, None] * strength[None, :] * times(fade, fade)
+
+
+def _multipliers(r: Float[Array, "m m"], sought: Float[Array, "m k"], jac: Float[Array, "m n"]) -> Float[Array, "m k"]:
+    """`mu` with `J' mu = Q' sought`, that is `R' mu = sought`, from the last row up; rows of which little is left over by those above them
+    bear no more than rounding allows."""
+    length = safe_sqrt(jnp.sum(jac * jac, axis=1))
+    least = (1e-6 if jac.dtype == jnp.float64 else 1e-3) * jnp.where(length > 0, length, jnp.ones_like(length))
+    pivot = jnp.diagonal(r)
+    inverse_pivot = pivot / (pivot * pivot + least * least)
+    m = r.shape[0]
+
+    def row(i: Int[Array, ""], mu: Float[Array, "m k"]) -> Float[Array, "m k"]:
+        k = m - 1 - i
+        column = jax.lax.dynamic_index_in_dim(r, k, 1, keepdims=False)  # R'[k, :]
+        rest = sought[k] - times(column[None], mu)[0]
+        return mu.at[k].set(rest * inverse_pivot[k])
+
+    return jax.lax.fori_loop(0, m, row, jnp.zeros_like(sought))

@@ -1,0 +1,273 @@
+"""Derivatives of a solved clip, forward and reverse, from the conditions that its frames fulfil; no iteration is stored.
+
+In: what was solved, and the solution. Out: the same poses, with a rule of differentiation: each frame's pose moves such that
+`conditions.balance` stays 0. Memory grows with frames, not with frames times iterations. `chained`: where a frame starts
+from the one before it (joints that are not attracted to the input, limbs held back as they straighten), its derivative goes
+on through the clip; else every frame's start counts as constant.
+
+Frames that were not solved are the input's, and so are their derivatives; what is not finite has the derivative 0.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..errors import OptionError
+from .chain import Chain, Pose, forward, moved, parent_rotations
+from .conditions import Factors, Numbers, Solved, balance, derivative, factors_of
+from .sequence import Carried, Frames
+from .tasks import Kinds, Tasks
+
+
+class Asked(NamedTuple):
+    """What a clip's poses follow from: everything that the derivatives are taken by (`sequence.solve_sequence`)."""
+
+    chain: Chain
+    tasks: Tasks
+    frames: Frames
+    first: Carried
+
+
+class Static(NamedTuple):
+    """What a program depends on."""
+
+    layers: int
+    kinds: Kinds
+    chained: bool
+
+
+class Poses(NamedTuple):
+    """Solved poses of F frames: local rotations (F, 4, P), root (F, 3)."""
+
+    rotations: Float[Array, "f 4 p"]
+    root: Float[Array, "f 3"]
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(3,))
+def attach(asked: Asked, numbers: Numbers, found: tuple[Poses, Bool[Array, " f"]], static: Static) -> Poses:
+    """The poses `found`, with their derivatives by `asked`. found: poses, and which frames the solver is sound in. What is in
+    `found` and in `numbers` counts as constant."""
+    return found[0]
+
+
+@attach.defjvp
+def _attached(static: Static, primals: Any, tangents: Any) -> tuple[Poses, Poses]:
+    asked, numbers, (poses, sound) = once(primals)
+    change = tangents[0]
+    places, known = _places(asked, poses, sound)
+    asked, change = _finite(asked, change, sound & known)
+    factors, response = jax.vmap(lambda frame, at: _frame(asked.chain, asked.tasks, frame, at, numbers, static))(
+        asked.frames, places
+    )
+
+    def moves(frame: Frames, at: Solved, factors: Factors, by: Any) -> Float[Array, " n"]:
+        """How the conditions move with everything but the pose itself and the pose before."""
+
+        def all_of(chain: Chain, tasks: Tasks, frame: Frames, before: Pose) -> Float[Array, " n"]:
+            there = at._replace(before=before)
+            return balance(chain, tasks, frame, there, factors, numbers, static.layers, static.kinds)
+
+        primal = asked.chain, asked.tasks, frame, at.before
+        return jax.jvp(all_of, primal, (change.chain, change.tasks, *by))[1]
+
+    before = _earlier(
+        Pose(change.frames.rotations[..., None], change.frames.root[..., None]), change.first.before, known
+    )
+    if not static.chained:
+        before = jax.tree.map(jnp.zeros_like, before)
+    b = jax.vmap(moves)(asked.frames, places, factors, (change.frames, before))
+    step = _times(response, b)
+    if static.chained:
+        step = _chain(asked, numbers, static, places, known, factors, response, step, change.first.pose)
+
+    def move(pose: Pose, offsets: Array, by: Array) -> Pose:
+        parent = parent_rotations(asked.chain, forward(asked.chain, pose, offsets))
+        free = asked.chain._replace(limits=None)
+        return jax.jvp(lambda s: moved(free, pose, parent, s[:, None]), (jnp.zeros_like(by),), (by,))[1]
+
+    change_of = jax.vmap(move)(places.pose, asked.frames.offsets, step)
+    keep = known[:, None]
+    return poses, Poses(
+        jnp.where(keep[..., None], change_of.rotations[..., 0], 0), jnp.where(keep, change_of.root[..., 0], 0)
+    )
+
+
+def distance(
+    asked: Asked, numbers: Numbers, poses: Poses, sound: Bool[Array, " f"], static: Static
+) -> Float[Array, " f"]:
+    """How far each frame is from fulfilling its conditions: the largest component, in radians or metres, of what one more step
+    would change; infinite where the solver was not sound."""
+    asked, numbers, poses = jax.lax.stop_gradient((asked, numbers, poses))
+    places, known = _places(asked, poses, sound)
+    asked, _ = _finite(asked, asked, sound & known)
+    left = jax.vmap(lambda frame, at: _left(asked.chain, asked.tasks, frame, at, numbers, static))(
+        asked.frames, places
+    )
+    return jnp.where(sound & known & jnp.isfinite(left), left, jnp.inf)
+
+
+def _left(chain: Chain, tasks: Tasks, frame: Frames, at: Solved, numbers: Numbers, static: Static) -> Array:
+    factors = factors_of(chain, tasks, frame, at, numbers, static.layers, static.kinds)
+    return jnp.max(jnp.abs(balance(chain, tasks, frame, at, factors, numbers, static.layers, static.kinds)))
+
+
+def _frame(
+    chain: Chain, tasks: Tasks, frame: Frames, at: Solved, numbers: Numbers, static: Static
+) -> tuple[Factors, Float[Array, "n n"]]:
+    """Factors, and how the pose responds to a change of the conditions; 0 where that is not finite."""
+    factors = factors_of(chain, tasks, frame, at, numbers, static.layers, static.kinds)
+    response = -jnp.linalg.inv(derivative(chain, tasks, frame, at, factors, numbers, static.layers, static.kinds))
+    return factors, jnp.where(jnp.isfinite(response).all(), response, 0)
+
+
+def _times(a: Float[Array, "f n n"], b: Float[Array, "f n"]) -> Float[Array, "f n"]:
+    return jnp.einsum("fij,fj->fi", a, b, precision="highest")
+
+
+def _places(asked: Asked, poses: Poses, sound: Bool[Array, " f"]) -> tuple[Solved, Bool[Array, " f"]]:
+    """Each frame's pose and those before it, with frames that are not finite left out: after one, the next starts from the last
+    that was. known: (F,) which frames are finite."""
+    own = Pose(asked.frames.rotations[..., None], asked.frames.root[..., None])
+    pose = Pose(poses.rotations[..., None], poses.root[..., None])
+    known = jnp.isfinite(pose.rotations).all((1, 2, 3)) & jnp.isfinite(pose.root).all((1, 2))
+    known &= jnp.isfinite(own.rotations).all((1, 2, 3)) & jnp.isfinite(own.root).all((1, 2))
+    last = _earlier(pose, asked.first.pose, known)
+    before = _earlier(own, asked.first.before, known)
+    still = jnp.eye(4, 1, dtype=poses.root.dtype)[None, :, None]
+    pose = Pose(
+        jnp.where(known[:, None, None, None], pose.rotations, still),
+        jnp.where(known[:, None, None], pose.root, 0),
+    )
+    return Solved(pose, last, before), known
+
+
+def _earlier(x: Pose, first: Pose, known: Bool[Array, " f"]) -> Pose:
+    """For every frame the last known one before it, `first` where there is none."""
+    index = jnp.arange(known.shape[0], dtype=jnp.int32)
+    until = jax.lax.cummax(jnp.where(known, index, -1))
+    at = jnp.concatenate([jnp.full(1, -1, jnp.int32), until[:-1]])
+
+    def pick(rows: Array, begin: Array) -> Array:
+        there = (at >= 0).reshape(-1, *[1] * begin.ndim)
+        return jnp.where(there, rows[jnp.maximum(at, 0)], begin[None])
+
+    return jax.tree.map(pick, x, first)
+
+
+def _finite(asked: Asked, change: Asked, good: Bool[Array, " f"]) -> tuple[Asked, Asked]:
+    """Frames that were not solved ask for nothing but their input; what is not finite is at rest and does not change."""
+
+    def clean(frames: Frames, safe: Frames) -> Frames:
+        def fill(x: Array, ok: Array, value: Array | float) -> Array:
+            return jnp.where(ok.reshape(-1, *[1] * (x.ndim - 1)), x, value)
+
+        def finite(x: Array) -> Array:
+            return jnp.isfinite(x).all(tuple(range(1, x.ndim)))
+
+        tangent = frames is not safe
+        still = 0.0 if tangent else jnp.eye(4, 1, dtype=x64_of(safe))[None]
+        own = finite(safe.rotations) & finite(safe.root)
+        goals, sane = frames.goals, safe.goals
+        place = jnp.isfinite(sane.place).all(-1, keepdims=True)
+        turn = jnp.isfinite(sane.rotation).all(-1, keepdims=True)
+        unit = 0.0 if tangent else jnp.eye(1, 4, dtype=x64_of(safe))[None]
+        goals = goals._replace(
+            place=jnp.where(place & good[:, None, None], goals.place, 0),
+            rotation=jnp.where(turn & good[:, None, None], goals.rotation, unit),
+            active=fill(goals.active, good, 0),
+            mass_point=jnp.where(jnp.isfinite(sane.mass_point), goals.mass_point, 0),
+        )
+        return frames._replace(
+            rotations=fill(frames.rotations, own, still),
+            root=fill(frames.root, own, 0),
+            offsets=jnp.where(jnp.isfinite(safe.offsets), frames.offsets, 0),
+            controlled=fill(frames.controlled, good, 0),
+            root_controlled=fill(frames.root_controlled, good, 0),
+            goals=goals,
+        )
+
+    return (
+        asked._replace(frames=clean(asked.frames, asked.frames)),
+        change._replace(frames=clean(change.frames, asked.frames)) if change is not asked else asked,
+    )
+
+
+def x64_of(frames: Frames) -> Any:
+    """The precision of a clip."""
+    return frames.root.dtype
+
+
+def _chain(
+    asked: Asked,
+    numbers: Numbers,
+    static: Static,
+    places: Solved,
+    known: Bool[Array, " f"],
+    factors: Factors,
+    response: Float[Array, "f n n"],
+    step: Float[Array, "f n"],
+    first: Pose,
+) -> Float[Array, "f n"]:
+    """Each frame's step with what the step of the frame before it adds: one linear recurrence over the clip."""
+    free = asked.chain._replace(limits=None)
+    offsets = _earlier_rows(asked.frames.offsets, known)
+
+    def through(frame: Frames, at: Solved, factors: Factors, response: Array, offsets: Array) -> Array:
+        parent = parent_rotations(asked.chain, forward(asked.chain, at.last, offsets))
+
+        def start(s: Float[Array, " n"]) -> Float[Array, " n"]:
+            there = at._replace(last=moved(free, at.last, parent, s[:, None]))
+            return balance(asked.chain, asked.tasks, frame, there, factors, numbers, static.layers, static.kinds)
+
+        by = jax.jacfwd(start)(jnp.zeros(response.shape[0], response.dtype))
+        return jnp.matmul(response, by, precision="highest")
+
+    links = jax.vmap(through)(asked.frames, places, factors, response, offsets)
+    # the first frame's start is moved by the pose that the clip begins from
+    frame, at, own = jax.tree.map(lambda x: x[0], (asked.frames, places, factors))
+
+    def begin(pose: Pose) -> Float[Array, " n"]:
+        there = at._replace(last=pose)
+        return balance(asked.chain, asked.tasks, frame, there, own, numbers, static.layers, static.kinds)
+
+    moved_first = jax.jvp(begin, (at.last,), (first,))[1]
+    step = step.at[0].add(jnp.matmul(response[0], moved_first, precision="highest"))
+    links = links.at[0].set(0)
+    links = jnp.where(jnp.isfinite(links).all((1, 2), keepdims=True), links, 0)
+
+    def follow(last: Array, x: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        own, link, seen = x
+        here = own + link @ last
+        return jnp.where(seen, here, last), here
+
+    return jax.lax.scan(follow, jnp.zeros_like(step[0]), (step, links, known))[1]
+
+
+def _earlier_rows(x: Float[Array, "f p 3"], known: Bool[Array, " f"]) -> Float[Array, "f p 3"]:
+    index = jnp.arange(known.shape[0], dtype=jnp.int32)
+    until = jax.lax.cummax(jnp.where(known, index, 0))
+    return x[jnp.concatenate([until[:1], until[:-1]])]
+
+
+@jax.custom_jvp
+def _same(x: Array) -> Array:
+    return x
+
+
+@_same.defjvp
+def _twice(primals: Any, tangents: Any) -> Any:
+    raise OptionError(
+        "a second derivative through the deformation was asked for: the implicit rule gives first derivatives only; "
+        'take gradient="unrolled"'
+    )
+
+
+def once(tree: Any) -> Any:
+    """The same arrays; to differentiate them is an error: what is made of them holds a first derivative already, and has constants
+    in it that a second one would need."""
+    return jax.tree.map(lambda x: _same(x) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
