@@ -1,0 +1,90 @@
+"""Rotations and mean poses on separate components: what is differentiated is never stacked.
+
+In and out: tuples of arrays of any one shape, (w, x, y, z) or (x, y, z). Values are those of `rotations` and `detect.displacements`;
+there a stack of components costs nothing, but the gradient of taking one apart is a padded copy for every component.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..detect.displacements import shifted
+from ..rotations import dot
+
+Parts = tuple[Float[Array, "..."], ...]
+
+
+def multiply(a: Parts, b: Parts) -> Parts:
+    """Hamilton product: first `b`, then `a`."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return (aw * bw - ax * bx - ay * by - az * bz, *vector_of_product(a, b))
+
+
+def vector_of_product(a: Parts, b: Parts) -> Parts:
+    """The last three components of the Hamilton product."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
+
+
+def conjugate(q: Parts) -> Parts:
+    """Inverse of a unit quaternion."""
+    return q[0], -q[1], -q[2], -q[3]
+
+
+def cross(a: Parts, b: Parts) -> Parts:
+    """Cross product."""
+    ax, ay, az = a
+    bx, by, bz = b
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+def rotate(q: Parts, v: Parts) -> Parts:
+    """Vectors turned by unit quaternions."""
+    t = tuple(x + x for x in cross(q[1:], v))
+    return tuple(x + q[0] * y + z for x, y, z in zip(v, t, cross(q[1:], t), strict=True))
+
+
+def normalize(q: Parts) -> Parts:
+    """Unit quaternion; zero and non-finite ones become the identity, with gradient 0."""
+    n2 = jax.lax.stop_gradient(dot(q, q))
+    good = (n2 > 0) & jnp.isfinite(n2)
+    parts = tuple(jnp.where(good, x, 0 if i else 1) for i, x in enumerate(q))
+    scale = jax.lax.rsqrt(dot(parts, parts))
+    return tuple(x * scale for x in parts)
+
+
+def matrix_elements(q: Parts) -> Parts:
+    """The nine elements of the rotation matrix of a unit quaternion, row by row."""
+    w, x, y, z = q
+    return (
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+def mean_pose(q: Parts, t: Parts, valid: Bool[Array, "objects frames"], half: int) -> tuple[Parts, Parts]:
+    """Mean pose over the valid ones of `2 half + 1` frames around each: `detect.displacements.mean_pose`.
+
+    Quaternions of one rotation may differ in sign from frame to frame; which signs agree is a constant.
+    """
+    weight = valid.astype(t[0].dtype)
+    fixed = [jax.lax.stop_gradient(x) for x in q]
+    here, sums_q, sums_t = weight, list(q), [jnp.zeros_like(x) for x in t]
+    for s in (s for s in range(-half, half + 1) if s):
+        w = shifted(weight, s)
+        sign = jnp.where(dot([shifted(x, s) for x in fixed], fixed) < 0, -w, w)
+        sums_q = [a + sign * shifted(x, s) for a, x in zip(sums_q, q, strict=True)]
+        sums_t = [a + w * (shifted(x, s) - x) for a, x in zip(sums_t, t, strict=True)]  # exact far from the origin
+        here = here + w
+    scale = 1 / jnp.maximum(here, 1)
+    mean_q = tuple(jnp.where(valid, a, b) for a, b in zip(normalize(tuple(sums_q)), q, strict=True))
+    return mean_q, tuple(jnp.where(valid, x + a * scale, x) for x, a in zip(t, sums_t, strict=True))
