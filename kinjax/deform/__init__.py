@@ -12,6 +12,7 @@ from .constraints import CenterOfMass, Goal, LookAt, Orientation, Position, Thro
 from .pipeline import deform, deform_many, redeform
 from .results import STATUSES, Deformation, Report
 from .settings import Settings
+from .whole_clip import Minimum, whole_clip
 
 __all__ = [
     "STATUSES",
@@ -21,6 +22,7 @@ __all__ = [
     "Deformation",
     "Goal",
     "LookAt",
+    "Minimum",
     "Orientation",
     "Position",
     "Report",
@@ -33,4 +35,5 @@ __all__ = [
     "deform_many",
     "redeform",
     "least_squares",
+    "whole_clip",
 ]

@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+Three = tuple[Array, Array, Array]
+
 
 class Bands(NamedTuple):
     """A symmetric matrix of F x F blocks: on the diagonal, and one and two below it.
@@ -54,7 +56,7 @@ def factorize(bands: Bands) -> Factors:
     n = bands.diagonal.shape[1]
     same = jnp.eye(n, dtype=bands.diagonal.dtype)
 
-    def step(carried: tuple[Array, ...], x: Bands) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    def step(carried: Three, x: Bands) -> tuple[Three, tuple[Array, ...]]:
         # below the diagonal, in the columns before this one: (t, t-1), (t+1, t-1), (t, t-2)
         left, under, far = carried
         pivot = x.diagonal - _dot(left, left.T) - _dot(far, far.T)
@@ -67,8 +69,8 @@ def factorize(bands: Bands) -> Factors:
         return (first, second, under), (lower, first, second, sound)
 
     none = jnp.zeros_like(same)
-    *blocks, sound = jax.lax.scan(step, (none, none, none), _inside(bands))[1]
-    return Factors(*blocks, sound.all())
+    diagonal, first, second, sound = jax.lax.scan(step, (none, none, none), _inside(bands))[1]
+    return Factors(diagonal, first, second, sound.all())
 
 
 def solve(factors: Factors, b: Float[Array, "f n"]) -> Float[Array, "f n"]:
@@ -96,8 +98,8 @@ def solve(factors: Factors, b: Float[Array, "f n"]) -> Float[Array, "f n"]:
 def _inside(bands: Bands) -> Bands:
     """The same, with zeros for the blocks that lie outside of the matrix."""
     frame = jnp.arange(bands.diagonal.shape[0], dtype=jnp.int32)[:, None, None]
-    kept = (jnp.where(frame < len(frame) - k, x, 0) for k, x in ((1, bands.first), (2, bands.second)))
-    return Bands(bands.diagonal, *kept)
+    first, second = (jnp.where(frame < len(frame) - k, x, 0) for k, x in ((1, bands.first), (2, bands.second)))
+    return Bands(bands.diagonal, first, second)
 
 
 def _later(x: Float[Array, "f n"], k: int) -> Float[Array, "f n"]:

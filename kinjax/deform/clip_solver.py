@@ -16,14 +16,22 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from .banded import Bands, factorize, solve
+from .banded import factorize, solve
 from .tasks import Kinds
 
 FIRST = 1e4
 """The first step size: the inverse of the damping."""
 
-FLOOR = 10.0
+FLOOR = 2.0
 """Damping is at least so many rounding errors of the largest curvature."""
+
+
+LITTLE, MUCH, FASTER = 0.01, 0.75, 10.0
+"""A step is taken that gains the share LITTLE of what was hoped for; the step size grows by FASTER where it gains MUCH, and
+shrinks by it where the step is refused."""
+
+MOST_ASIDE = 0.4
+"""A step is bent by no more than this share of its length."""
 
 
 class Found(NamedTuple):
@@ -38,67 +46,108 @@ class Found(NamedTuple):
 
 
 class Local(eqx.Module):
-    """The quadratic model at the last accepted displacements `at`, and how far those before were (`moved`, largest entry)."""
+    """The model at the last accepted displacements `at`, how far those before were (`moved`, largest entry), and a bound of its
+    curvature (`most`)."""
 
     at: Array
-    bands: Bands
+    jac: Array
     gradient: Array
     moved: Array
+    most: Array
+
+
+def damping_of(step_size: Array, most: Array) -> Array:
+    """What is added to the diagonal: never less than the rounding of the largest curvature."""
+    return 1 / step_size + FLOOR * jnp.finfo(step_size.dtype).eps * most
 
 
 class BandedDescent(optx.AbstractDescent):
-    """The step `-(A + d I)^-1 g` of damping `d = 1 / step_size`, by block Cholesky."""
+    """The step `v = -(A + d I)^-1 g` of damping `d = 1 / step_size`, by block Cholesky, and along its parabola.
+
+    The minimum lies in a narrow curved valley: weak terms along it, the constraints across. So half of the acceleration
+    `-(A + d I)^-1 J' r''(v, v)` is added to the step: it bends the way so that the residuals stay as the linear model has
+    them (geodesic acceleration, Transtrum and Sethna 2012), for one more solve with the same factors.
+    """
 
     problem: Any
     kinds: Kinds = eqx.field(static=True)
 
     def init(self, y: Any, f_info_struct: Any) -> Local:
-        none = jnp.zeros((*y.shape, y.shape[1]), y.dtype)
-        return Local(y, Bands(none, none, none), jnp.zeros_like(y), jnp.zeros((), y.dtype))
+        rows = 3 * self.problem.tasks.kind.shape[0]
+        jac = jnp.zeros((y.shape[0], rows, y.shape[1]), y.dtype)
+        none = jnp.zeros((), y.dtype)
+        return Local(y, jac, jnp.zeros_like(y), none, none)
 
     def query(self, y: Any, f_info: Any, state: Local) -> Local:
-        return Local(y, *self.problem.curvature(self.kinds, y), jnp.max(jnp.abs(y - state.at)))
+        jac, gradient = self.problem.linear(self.kinds, y)
+        most = 4 * jnp.max(jnp.sum(jnp.abs(self.problem.curvature(jac).diagonal), axis=-1))
+        return Local(y, jac, gradient, jnp.max(jnp.abs(y - state.at)), most)
 
     def step(self, step_size: Any, state: Local) -> Any:
-        diagonal = state.bands.diagonal
+        bands = self.problem.curvature(state.jac)
+        diagonal = bands.diagonal
         same = jnp.eye(diagonal.shape[1], dtype=diagonal.dtype)
-        most = jnp.max(jnp.sum(jnp.abs(diagonal), axis=-1))
-        damping = 1 / step_size + FLOOR * jnp.finfo(diagonal.dtype).eps * most
-        factors = factorize(state.bands._replace(diagonal=diagonal + damping * same))
-        # where rounding leaves it not positive definite: so short a way down that the model holds
-        down = state.gradient / (damping + 4 * most)
-        return -jnp.where(factors.sound, solve(factors, state.gradient), down), optx.RESULTS.successful
+        damping = damping_of(step_size, state.most)
+        factors = factorize(bands._replace(diagonal=diagonal + damping * same))
+        straight = -solve(factors, state.gradient)
+        bend = self.problem.bend(self.kinds, state.at, straight).reshape(state.jac.shape[:2])
+        aside = -solve(factors, jnp.einsum("fm,fmn->fn", bend, state.jac, precision="highest")) / 2
+        usable = jnp.sum(aside * aside) <= MOST_ASIDE**2 * jnp.sum(straight * straight)
+        step = straight + jnp.where(usable, aside, 0)
+        # where rounding leaves the matrix not positive definite: a way up, which is refused, and more damping follows
+        up = state.gradient / (damping + state.most)
+        return jnp.where(factors.sound, step, up), optx.RESULTS.successful
 
 
-class TrustRegion(optx.ClassicalTrustRegion):
-    """optimistix' classical one that starts with little damping: steps are long where the problem is nearly linear."""
+class TrustRegion(optx.AbstractSearch):
+    """Takes a step that gains a share of what the model of second order, which `BandedDescent` follows, hopes for; its state is
+    the step size, which grows where most of that came true.
+
+    Steps that gain or lose no more than the rounding of the sum are taken: near the minimum the step itself tells more
+    than what it gains.
+    """
+
+    problem: Any
+    kinds: Kinds = eqx.field(static=True)
 
     def init(self, y: Any, f_info_struct: Any) -> Any:
-        state = super().init(y, f_info_struct)
-        return eqx.tree_at(lambda s: s.step_size, state, jnp.asarray(FIRST, y.dtype))
+        return jnp.asarray(FIRST, y.dtype)
+
+    def step(self, first_step: Any, y: Any, y_eval: Any, f_info: Any, f_eval_info: Any, state: Any) -> Any:
+        way = y_eval - y
+        ahead = jax.tree.map(jnp.add, f_info.residual, f_info.jac.mv(way))
+        ahead = ahead._replace(constraints=ahead.constraints + self.problem.bend(self.kinds, y, way) / 2)
+        before, now = f_info.as_min(), f_eval_info.as_min()
+        hoped = sum((jnp.sum(x * x) for x in ahead[1:]), jnp.sum(ahead[0] * ahead[0])) / 2 - before
+        level = FLOOR * jnp.finfo(now.dtype).eps * before
+        equal = (jnp.abs(now - before) <= level) & (jnp.abs(hoped) <= level)
+        taken = (now - before <= LITTLE * hoped) | equal | first_step
+        good = (now - before < MUCH * hoped) & (hoped < 0) & ~first_step
+        size = state * jnp.where(good, FASTER, jnp.where(taken, 1, 1 / FASTER))
+        return size, taken, optx.RESULTS.successful, size
 
 
 class BandedLevenbergMarquardt(optx.AbstractGaussNewton):
     """Levenberg-Marquardt with a `BandedDescent`, for at most `steps` trials.
 
-    It stops where the undamped step would be shorter than `tolerance`: a damped one is that long, at least, divided by
-    1 + damping / (least curvature), and no curvature is below `least`.
+    It stops where the undamped step would be shorter than `tolerance`: a damped one is as long, at least, divided by
+    1 + damping / `least`, the least curvature that there can be.
     """
 
+    rtol: float
+    atol: float
+    norm: Callable
     descent: BandedDescent
     search: TrustRegion
+    verbose: Callable
     steps: Any
     tolerance: Any
     least: Any
-    rtol: float = 0.0
-    atol: float = 0.0
-    norm: Callable = optx.max_norm
-    verbose: Callable = eqx.field(static=True, default=lambda **_: None)
 
     def converged(self, state: Any) -> Any:
         """Whether the last trial was accepted and led to nothing new."""
         taken = (state.num_steps_since_acceptance == 0) & (state.num_accepted_steps > 1)
-        damping = self.search.high_constant / state.search_state.step_size
+        damping = damping_of(state.search_state / FASTER, state.descent_state.most)
         return taken & (state.descent_state.moved * (1 + damping / self.least) < self.tolerance)
 
     def terminate(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> Any:
@@ -107,11 +156,23 @@ class BandedLevenbergMarquardt(optx.AbstractGaussNewton):
 
 def minimise(problem: Any, kinds: Kinds, start: Array, steps: Array, tolerance: Array) -> Found:
     """The displacements near `start` of the least sum of squares."""
-    search = TrustRegion(high_cutoff=0.75, low_cutoff=0.01, high_constant=10.0, low_constant=0.1)
-    least = problem.weights.attraction**2
-    solver = BandedLevenbergMarquardt(BandedDescent(problem, kinds), search, steps, tolerance, least)
+    solver: Any = BandedLevenbergMarquardt(
+        rtol=0.0,
+        atol=0.0,
+        norm=optx.max_norm,
+        descent=BandedDescent(problem, kinds),
+        search=TrustRegion(problem, kinds),
+        verbose=_quiet,
+        steps=steps,
+        tolerance=tolerance,
+        least=problem.weights.attraction**2,
+    )
     got: Any = optx.least_squares(lambda u, p: p.errors(kinds, u), solver, start, problem, max_steps=None, throw=False)
     left = problem.errors(kinds, got.value)
-    cost = sum(jnp.sum(x * x) for x in left) / 2
-    gradient = jnp.max(jnp.abs(problem.curvature(kinds, got.value)[1]))
+    cost = sum((jnp.sum(x * x) for x in left[1:]), jnp.sum(left[0] * left[0])) / 2
+    gradient = jnp.max(jnp.abs(problem.linear(kinds, got.value).gradient))
     return Found(got.value, cost, gradient, got.stats["num_steps"], solver.converged(got.state))
+
+
+def _quiet(**_: Any) -> None:
+    """Says nothing."""
