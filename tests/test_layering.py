@@ -26,7 +26,8 @@ DETECT = (
 DEFORM = (
     "constraints", "settings", "results", "prioritized", "chain", "tasks", "loops", "frame_solver", "sequence", "kochanek_bartels",
     "shape", "recruiting", "filtering", "targets", "balance", "body", "resolving", "layout", "plan", "reuse", "solving",
-    "reporting", "pipeline", "comparison", "banded", "clip_problem", "clip_solver", "whole_clip", "cleaning", "conditions", "implicit", "arrangement", "bending",
+    "reporting", "pipeline", "comparison", "banded", "clip_problem", "clip_solver", "whole_clip", "cleaning",
+    "conditions", "implicit", "arrangement", "bending",
 )  # fmt: skip
 STRANGERS = ({"detect", "deform"}, {"studio", "cli"}, {"plots", "database"})
 CLI = (
