@@ -30,6 +30,9 @@ LITTLE, MUCH, FASTER = 0.01, 0.75, 10.0
 """A step is taken that gains the share LITTLE of what was hoped for; the step size grows by FASTER where it gains MUCH, and
 shrinks by it where the step is refused."""
 
+SLOW = 1e-3
+"""In float32 a step that gains a smaller share of the sum is the last."""
+
 MOST_ASIDE = 0.4
 """A step is bent by no more than this share of its length."""
 
@@ -46,14 +49,16 @@ class Found(NamedTuple):
 
 
 class Local(eqx.Module):
-    """The model at the last accepted displacements `at`, how far those before were (`moved`, largest entry), and a bound of its
-    curvature (`most`)."""
+    """The model at the last accepted displacements `at`, how far those before were (`moved`, largest entry), a bound of its
+    curvature (`most`), the `cost` and what was `gained` by the last step."""
 
     at: Array
     jac: Array
     gradient: Array
     moved: Array
     most: Array
+    cost: Array
+    gained: Array
 
 
 def damping_of(step_size: Array, most: Array) -> Array:
@@ -76,12 +81,13 @@ class BandedDescent(optx.AbstractDescent):
         rows = 3 * self.problem.tasks.kind.shape[0]
         jac = jnp.zeros((y.shape[0], rows, y.shape[1]), y.dtype)
         none = jnp.zeros((), y.dtype)
-        return Local(y, jac, jnp.zeros_like(y), none, none)
+        return Local(y, jac, jnp.zeros_like(y), none, none, none, none)
 
     def query(self, y: Any, f_info: Any, state: Local) -> Local:
         jac, gradient = self.problem.linear(self.kinds, y)
         most = 4 * jnp.max(jnp.sum(jnp.abs(self.problem.curvature(jac).diagonal), axis=-1))
-        return Local(y, jac, gradient, jnp.max(jnp.abs(y - state.at)), most)
+        cost = f_info.as_min()
+        return Local(y, jac, gradient, jnp.max(jnp.abs(y - state.at)), most, cost, state.cost - cost)
 
     def step(self, step_size: Any, state: Local) -> Any:
         bands = self.problem.curvature(state.jac)
@@ -131,7 +137,8 @@ class BandedLevenbergMarquardt(optx.AbstractGaussNewton):
     """Levenberg-Marquardt with a `BandedDescent`, for at most `steps` trials.
 
     It stops where the undamped step would be shorter than `tolerance`: a damped one is as long, at least, divided by
-    1 + damping / `least`, the least curvature that there can be.
+    1 + damping / `least`, the least curvature that there can be. Where rounding hides curvatures of that size (float32), it
+    stops at a step that gains less than the share `SLOW` of the sum.
     """
 
     rtol: float
@@ -147,8 +154,11 @@ class BandedLevenbergMarquardt(optx.AbstractGaussNewton):
     def converged(self, state: Any) -> Any:
         """Whether the last trial was accepted and led to nothing new."""
         taken = (state.num_steps_since_acceptance == 0) & (state.num_accepted_steps > 1)
-        damping = damping_of(state.search_state / FASTER, state.descent_state.most)
-        return taken & (state.descent_state.moved * (1 + damping / self.least) < self.tolerance)
+        local = state.descent_state
+        damping = damping_of(state.search_state / FASTER, local.most)
+        short = local.moved * (1 + damping / self.least) < self.tolerance
+        blunt = FLOOR * jnp.finfo(local.most.dtype).eps * local.most > self.least
+        return taken & (short | (blunt & (local.gained <= SLOW * local.cost)))
 
     def terminate(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> Any:
         return self.converged(state) | (state.num_steps > self.steps), state.result

@@ -52,7 +52,8 @@ from .tasks import Kinds
 class Minimum:
     """What was found: `Deformation.again` of `whole_clip`.
 
-    steps: tried. converged: the undamped step that is left is below the tolerance. cost: half the sum of squares. gradient: its
+    steps: tried. converged: the undamped step that is left is below the tolerance (in float32, or the last step gained next
+    to nothing). cost: half the sum of squares. gradient: its
     derivative with the largest size. displacement: (F, 3 + 3 J) of the root's translation and of all joints of the
     skeleton, metres and radians.
     """
@@ -93,7 +94,7 @@ def whole_clip(
     seconds), acceleration (times seconds squared) and attraction (metres a radian, above 0): weights of the displacement
     map's first and second derivative and of itself, a metre of the root counting as a radian. steps: trials at most.
     tolerance: it is done when the undamped step that is left would move nothing by more than so many radians or metres
-    (1e-3 at least in float32). start: a motion of the same frames to start from, the result of `deform` for instance;
+    (1e-3 at least in float32, where it also ends at a step that gains less than a thousandth). start: a motion of the same frames to start from, the result of `deform` for instance;
     default the input.
 
     Of `settings`, `precision` and `held` count; there are no limits, no filter and no strict priorities. The report's
