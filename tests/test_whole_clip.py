@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from deform_cases import FIGURE, NAMES, quaternions, standing
+from deform_cases import NAMES, quaternions, standing
 from scipy.linalg import solveh_banded
 from scipy.optimize import least_squares as scipy_least_squares
 from scipy.spatial.transform import Rotation
@@ -78,7 +78,10 @@ def test_banded_against_dense(precision, frames):
     close = 1e-10 if precision == "float64" else 1e-5
     assert bool(factors.sound) and x.dtype == precision
     assert np.abs(x.reshape(-1) - np.linalg.solve(matrix, b.reshape(-1))).max() < close
-    assert np.abs(np.asarray(times(cast, jnp.asarray(b, precision))).reshape(-1) - matrix @ b.reshape(-1)).max() < 10 * close
+    assert (
+        np.abs(np.asarray(times(cast, jnp.asarray(b, precision))).reshape(-1) - matrix @ b.reshape(-1)).max()
+        < 10 * close
+    )
 
 
 def test_banded_against_scipy_with_blocks_of_one(x64):
@@ -95,7 +98,10 @@ def test_banded_padding_and_batches(x64):
     rng = np.random.default_rng(1)
     cases = [dense_case(5, 3, rng)[1] for _ in range(3)]
     b = rng.normal(size=(3, 5, 3))
-    alone = [np.asarray(solve(factorize(jax.tree.map(jnp.asarray, c)), jnp.asarray(x))) for c, x in zip(cases, b, strict=True)]
+    alone = [
+        np.asarray(solve(factorize(jax.tree.map(jnp.asarray, c)), jnp.asarray(x)))
+        for c, x in zip(cases, b, strict=True)
+    ]
 
     def filled(c: Bands) -> Bands:
         first, second = c.first.copy(), c.second.copy()
@@ -229,7 +235,14 @@ def bent_arm(arm):
 def test_the_minimum_is_scipys(arm, bent_arm):
     """Terms by NumPy, derivatives by differences, SciPy's optimiser, from the input."""
     found = scipy_least_squares(
-        arm_terms, np.zeros(12 * ARM_FRAMES), jac="3-point", args=(arm,), xtol=1e-14, ftol=1e-15, gtol=1e-12, max_nfev=400
+        arm_terms,
+        np.zeros(12 * ARM_FRAMES),
+        jac="3-point",
+        args=(arm,),
+        xtol=1e-14,
+        ftol=1e-15,
+        gtol=1e-12,
+        max_nfev=400,
     )
     ours = bent_arm.again.displacement[:, :12]
     assert bent_arm.again.converged and np.abs(ours).max() > 0.2
@@ -243,9 +256,7 @@ def test_gradient_is_zero_at_the_result(arm, bent_arm):
 
     def slope(x: np.ndarray) -> float:
         steps = 1e-5 * np.eye(len(x))
-        return max(
-            abs((arm_terms(x + d, arm) ** 2).sum() - (arm_terms(x - d, arm) ** 2).sum()) / 4e-5 for d in steps
-        )
+        return max(abs((arm_terms(x + d, arm) ** 2).sum() - (arm_terms(x - d, arm) ** 2).sum()) / 4e-5 for d in steps)
 
     assert slope(x) < 1e-8 and slope(0 * x) > 1e-2
     assert bent_arm.again.gradient < 1e-8
@@ -300,7 +311,9 @@ def test_a_higher_layer_holds_better(motion, ratio):
     """Two goals for one hand: the mean of both, weighted by the squares, as far as the weak terms let it."""
     a, b = np.array([0.3, 0.3, 1.2]), np.array([0.3, 0.3, 1.3])
     goals = [*(replace(f, priority=3) for f in FEET)]
-    goals += [Position("LeftHand", at=x, begin=15, end=25, ease_in=0.1, ease_out=0.1, priority=p) for x, p in ((a, 2), (b, 1))]
+    goals += [
+        Position("LeftHand", at=x, begin=15, end=25, ease_in=0.1, ease_out=0.1, priority=p) for x, p in ((a, 2), (b, 1))
+    ]
     d = whole_clip(motion, goals, ratio=ratio, acceleration=1e-5)
     high, low = d.report.residual[20, 2:]
     assert high == pytest.approx(0.1 / (1 + ratio**2), rel=0.03) and low == pytest.approx(0.1 - high, rel=0.01)
@@ -402,7 +415,9 @@ def test_lengths_of_one_bucket_and_other_numbers_compile_nothing(motion, compila
     whole_clip(motion, REACH)
     assert compilations  # the listener hears
     compilations.clear()
-    whole_clip(standing(61, sway=0.1), REACH[::-1], ratio=5.0, velocity=0.0, acceleration=1e-3, attraction=1e-2, steps=7)
+    whole_clip(
+        standing(61, sway=0.1), REACH[::-1], ratio=5.0, velocity=0.0, acceleration=1e-3, attraction=1e-2, steps=7
+    )
     assert not compilations
 
 
@@ -423,7 +438,9 @@ def test_memory_grows_with_the_frames(x64):
         problem, kinds = laid_out(standing(frames), REACH, "float64")
         start = np.zeros((frames, 3 + 3 * problem.spread.shape[1]))
         with jax.numpy_dtype_promotion("standard"):
-            made = jax.make_jaxpr(lambda p, s, k=kinds: minimise(p, k, s, jnp.int32(9), jnp.float64(1e-6)))(problem, start)
+            made = jax.make_jaxpr(lambda p, s, k=kinds: minimise(p, k, s, jnp.int32(9), jnp.float64(1e-6)))(
+                problem, start
+            )
         largest.append(max(sizes(made.jaxpr)))
         unknowns.append(start.size)
     assert largest[1] <= 2 * largest[0] and largest[1] < unknowns[1] ** 2 / 100
@@ -432,7 +449,14 @@ def test_memory_grows_with_the_frames(x64):
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"ratio": 0.0}, {"attraction": 0.0}, {"velocity": -1.0}, {"acceleration": float("nan")}, {"steps": 0}, {"tolerance": "1"}],
+    [
+        {"ratio": 0.0},
+        {"attraction": 0.0},
+        {"velocity": -1.0},
+        {"acceleration": float("nan")},
+        {"steps": 0},
+        {"tolerance": "1"},
+    ],
     ids=str,
 )
 def test_numbers_that_make_no_sense(motion, wrong):

@@ -94,8 +94,8 @@ def whole_clip(
     seconds), acceleration (times seconds squared) and attraction (metres a radian, above 0): weights of the displacement
     map's first and second derivative and of itself, a metre of the root counting as a radian. steps: trials at most.
     tolerance: it is done when the undamped step that is left would move nothing by more than so many radians or metres
-    (1e-3 at least in float32, where it also ends at a step that gains less than a thousandth). start: a motion of the same frames to start from, the result of `deform` for instance;
-    default the input.
+    (1e-3 at least in float32, where it also ends at a step that gains less than a thousandth). start: a motion of the
+    same frames to start from, the result of `deform` for instance; default the input.
 
     Of `settings`, `precision` and `held` count; there are no limits, no filter and no strict priorities. The report's
     statuses: "converged" where a constraint holds, else "stalled" where this is the minimum and "max_iter" where `steps`
