@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from ..numerics import safe_divide
 from .banded import factorize, solve
 from .tasks import Kinds
 
@@ -32,6 +33,9 @@ shrinks by it where the step is refused."""
 
 SLOW = 1e-3
 """In float32 a step that gains a smaller share of the sum is the last."""
+
+LONGEST = 0.5
+"""Radians or metres that any unknown moves by in one step at most, bends apart."""
 
 MOST_ASIDE = 0.4
 """A step is bent by no more than this share of its length."""
@@ -98,8 +102,11 @@ class BandedDescent(optx.AbstractDescent):
         straight = -solve(factors, state.gradient)
         bend = self.problem.bend(self.kinds, state.at, straight).reshape(state.jac.shape[:2])
         aside = -solve(factors, jnp.einsum("fm,fmn->fn", bend, state.jac, precision="highest")) / 2
-        usable = jnp.sum(aside * aside) <= MOST_ASIDE**2 * jnp.sum(straight * straight)
-        step = straight + jnp.where(usable, aside, 0)
+        # half turns and more look near to rotations, and are far: no step is so long
+        short = jnp.minimum(1, safe_divide(LONGEST * jnp.ones_like(damping), jnp.max(jnp.abs(straight))))
+        short = jnp.where(short > 0, short, 1)
+        usable = short**2 * jnp.sum(aside * aside) <= MOST_ASIDE**2 * jnp.sum(straight * straight)
+        step = short * straight + jnp.where(usable, short**2 * aside, 0)
         # where rounding leaves the matrix not positive definite: a way up, which is refused, and more damping follows
         up = state.gradient / (damping + state.most)
         return jnp.where(factors.sound, step, up), optx.RESULTS.successful

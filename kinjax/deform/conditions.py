@@ -20,11 +20,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ..numerics import safe_divide, safe_sqrt
-from .chain import Chain, Pose, forward, moved, parent_rotations
+from .chain import Chain, Pose, World, forward, moved, parent_rotations
 from .frame_solver import Reference, attraction
 from .prioritized import Basis, inverse, row_basis, times
 from .sequence import Frames, displaced
-from .tasks import CENTER_OF_MASS, Kinds, Tasks, jacobian, look, residuals
+from .tasks import CENTER_OF_MASS, Kinds, Tasks, jacobian, look, residuals, wrench
 
 FAINT = 0.02
 """Directions in which a layer moves less than this share of its rows' root mean square length are held back: there the
@@ -67,7 +67,12 @@ def factors_of(
     chain: Chain, tasks: Tasks, frame: Frames, at: Solved, numbers: Numbers, layers: int, kinds: Kinds
 ) -> Factors:
     """The constants at a pose."""
-    r, jac, pull, _ = _asked(chain, tasks, frame, at, numbers, kinds)
+    world = forward(chain, at.pose, frame.offsets)
+    seen = look(tasks, frame.goals, world)
+    r = residuals(tasks, frame.goals, seen, kinds).reshape(-1)
+    jac = jacobian(chain, tasks, frame.goals, world, seen, kinds)
+    parent = parent_rotations(chain, world)
+    pull = _pull(frame, at.pose, parent, numbers) + from_start(frame, at, parent, numbers)[0]
     basis = row_basis(jac)
     rows = jnp.repeat(tasks.layer, 3)
     same = (rows[:, None] == rows[None, :]).astype(jac.dtype)
@@ -100,16 +105,60 @@ def balance(
     kinds: Kinds,
 ) -> Float[Array, " n"]:
     """The conditions: 0 at a pose where nothing can be gained, else about the step that is missing."""
-    r, jac, pull, travel = _asked(chain, tasks, frame, at, numbers, kinds)
-    rows = jnp.repeat(tasks.layer, 3)
+    world = forward(chain, at.pose, frame.offsets)
+    own = _balance(chain, tasks, frame, at.pose, world, factors, numbers, layers, kinds)
+    return own + of_start(factors, *from_start(frame, at, parent_rotations(chain, world), numbers))
+
+
+def _balance(
+    chain: Chain,
+    tasks: Tasks,
+    frame: Frames,
+    pose: Pose,
+    world: World,
+    factors: Factors,
+    numbers: Numbers,
+    layers: int,
+    kinds: Kinds,
+) -> Float[Array, " n"]:
+    """The part of the conditions that does not look at the frame before."""
+    seen = look(tasks, frame.goals, world)
+    r = residuals(tasks, frame.goals, seen, kinds).reshape(-1)
     q = factors.basis.rows
-    member = _members(rows, layers, r.dtype)
-    asked = jnp.concatenate([r[:, None] * member, jnp.zeros_like(r[:, None])], axis=1) - factors.multipliers.T
-    gains = times(jac.T, asked)  # (n, N + 1)
+    member = _members(jnp.repeat(tasks.layer, 3), layers, r.dtype)
+    load = jnp.concatenate([r[:, None] * member, jnp.zeros_like(r[:, None])], axis=1) - factors.multipliers.T
+    gains = wrench(chain, tasks, frame.goals, world, seen, kinds, load)  # (n, N + 1)
     own = jnp.sum(times(q, gains[:, :layers]) * member, axis=1)
-    y = times(factors.solve, own - times(factors.dragged, times(q, travel)))
-    free = pull + gains[:, layers]
-    return times(q.T, y - times(q, free)) + free
+    free = _pull(frame, pose, parent_rotations(chain, world), numbers) + gains[:, layers]
+    return times(q.T, times(factors.solve, own) - times(q, free)) + free
+
+
+def _pull(frame: Frames, pose: Pose, parent: Float[Array, "p 3 3"], numbers: Numbers) -> Float[Array, " n"]:
+    """The attraction to the input."""
+    stays, stays_root = _staying(frame, numbers)
+    return attraction(Reference(frame.rotations, frame.root, 1 - stays, 1 - stays_root), pose, parent)
+
+
+def from_start(
+    frame: Frames, at: Solved, parent: Float[Array, "p 3 3"], numbers: Numbers
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """All that depends on the frame before: the way back to the start of what is not attracted to the input, and the way that
+    everything has come from it. A joint's depend on that joint alone."""
+    own = Pose(frame.rotations[..., None], frame.root[:, None])
+    turning = frame.controlled * frame.warm
+    sliding = frame.root_controlled * frame.warm * frame.goals.root_free
+    start = displaced(own, at.last, at.before, turning, sliding)
+    ones = jnp.ones_like(frame.controlled), jnp.ones_like(frame.root_controlled)
+    back = attraction(Reference(start.rotations[..., 0], start.root[:, 0], *ones), at.pose, parent)
+    stays, stays_root = _staying(frame, numbers)
+    return back * jnp.concatenate([jnp.repeat(stays_root, 3), jnp.repeat(stays, 3)]), -back
+
+
+def of_start(factors: Factors, back: Float[Array, " n"], travel: Float[Array, " n"]) -> Float[Array, " n"]:
+    """What both do to the conditions: linear in them."""
+    q = factors.basis.rows
+    held = times(factors.solve, times(factors.dragged, times(q, travel)))
+    return back - times(q.T, times(q, back) + held)
 
 
 def derivative(
@@ -123,38 +172,50 @@ def derivative(
     kinds: Kinds,
 ) -> Float[Array, "n n"]:
     """How `balance` changes with a step of the pose, along world axes; along faint directions it counts as if they moved."""
-    parent = parent_rotations(chain, forward(chain, at.pose, frame.offsets))
+    world = forward(chain, at.pose, frame.offsets)
+    parent = parent_rotations(chain, world)
     free = chain._replace(limits=None)
 
     def after(step: Float[Array, " n"]) -> Float[Array, " n"]:
         pose = moved(free, at.pose, parent, step[:, None])
-        return balance(chain, tasks, frame, at._replace(pose=pose), factors, numbers, layers, kinds)
+        there = nearby(chain, world, step)
+        own = _balance(chain, tasks, frame, pose, there, factors, numbers, layers, kinds)
+        past = from_start(frame, at._replace(pose=pose), parent_rotations(chain, there), numbers)
+        return own + of_start(factors, *past)
 
     q = factors.basis.rows
     faint = times(factors.solve, times(factors.hold - factors.dragged, q))
     return jax.jacfwd(after)(jnp.zeros(3 + 3 * parent.shape[0], parent.dtype)) - times(q.T, faint)
 
 
-def _asked(
-    chain: Chain, tasks: Tasks, frame: Frames, at: Solved, numbers: Numbers, kinds: Kinds
-) -> tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " n"], Float[Array, " n"]]:
-    """Residuals, Jacobian, where the pose is drawn to when no row minds, and how far it has come from its start."""
-    world = forward(chain, at.pose, frame.offsets)
-    seen = look(tasks, frame.goals, world)
-    r = residuals(tasks, frame.goals, seen, kinds).reshape(-1)
-    jac = jacobian(chain, tasks, frame.goals, world, seen, kinds)
-    parent = parent_rotations(chain, world)
-    own = Pose(frame.rotations[..., None], frame.root[:, None])
-    turning = frame.controlled * frame.warm
-    sliding = frame.root_controlled * frame.warm * frame.goals.root_free
-    start = displaced(own, at.last, at.before, turning, sliding)
-    # a joint that is not controlled is the input's; one that is and is not attracted stays where it started
-    stays = (1 - numbers.attracted[0]) * frame.controlled
-    stays_root = (1 - numbers.attracted[1]) * frame.root_controlled
-    to_input = attraction(Reference(frame.rotations, frame.root, 1 - stays, 1 - stays_root), at.pose, parent)
-    to_start = attraction(Reference(start.rotations[..., 0], start.root[:, 0], stays, stays_root), at.pose, parent)
-    every = Reference(start.rotations[..., 0], start.root[:, 0], jnp.ones_like(stays), jnp.ones_like(stays_root))
-    return r, jac, to_input + to_start, -attraction(every, at.pose, parent)
+def nearby(chain: Chain, world: World, step: Float[Array, " n"]) -> World:
+    """World transforms after a step so small that its square does not count: what `forward` has for a derivative, without the
+    recursion."""
+    joints = world.shape[0] - 1
+    turn = step[3:].reshape(joints, 3)
+    place = world[:joints, :, 3, 0]
+    turned = jnp.sum(chain.above[:, :, None] * turn[None], axis=1)
+    slid = jnp.sum(chain.above[:, :, None] * _cross(turn, place)[None], axis=1)
+    shift = _cross(turned, place) - slid + step[:3]
+    change = jnp.concatenate(
+        [_cross(turned[:, None], jnp.swapaxes(world[:joints, :, :3, 0], 1, 2)).swapaxes(1, 2), shift[:, :, None]], axis=2
+    )
+    return world.at[:joints, :, :, 0].add(change)
+
+
+def _cross(a: Float[Array, "... 3"], b: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+    ax, ay, az = (a[..., i] for i in range(3))
+    bx, by, bz = (b[..., i] for i in range(3))
+    return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+
+
+def _staying(frame: Frames, numbers: Numbers) -> tuple[Float[Array, " p"], Float[Array, ""]]:
+    """Joints, and whether the root's place, that stay where the frame started: controlled and not attracted to the input. What is
+    not controlled is the input's."""
+    return (
+        (1 - numbers.attracted[0]) * frame.controlled,
+        (1 - numbers.attracted[1]) * frame.root_controlled,
+    )
 
 
 def _members(rows: Int[Array, " m"], layers: int, dtype: jnp.dtype) -> Float[Array, "m layers"]:

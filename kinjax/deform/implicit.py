@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..errors import OptionError
 from .chain import Chain, Pose, forward, moved, parent_rotations
-from .conditions import Factors, Numbers, Solved, balance, derivative, factors_of
+from .conditions import Factors, Numbers, Solved, balance, derivative, factors_of, from_start, of_start
 from .sequence import Carried, Frames
 from .tasks import Kinds, Tasks
 
@@ -68,22 +68,24 @@ def _attached(static: Static, primals: Any, tangents: Any) -> tuple[Poses, Poses
     def moves(frame: Frames, at: Solved, factors: Factors, by: Any) -> Float[Array, " n"]:
         """How the conditions move with everything but the pose itself and the pose before."""
 
-        def all_of(chain: Chain, tasks: Tasks, frame: Frames, before: Pose) -> Float[Array, " n"]:
-            there = at._replace(before=before)
+        def all_of(chain: Chain, tasks: Tasks, frame: Frames, last: Pose, before: Pose) -> Float[Array, " n"]:
+            there = at._replace(last=last, before=before)
             return balance(chain, tasks, frame, there, factors, numbers, static.layers, static.kinds)
 
-        primal = asked.chain, asked.tasks, frame, at.before
+        primal = asked.chain, asked.tasks, frame, at.last, at.before
         return jax.jvp(all_of, primal, (change.chain, change.tasks, *by))[1]
 
-    before = _earlier(
-        Pose(change.frames.rotations[..., None], change.frames.root[..., None]), change.first.before, known
-    )
-    if not static.chained:
-        before = jax.tree.map(jnp.zeros_like, before)
-    b = jax.vmap(moves)(asked.frames, places, factors, (change.frames, before))
+    # the poses before move, too: here as far as they are given, in `_chain` as far as they are solved
+    inputs = Pose(change.frames.rotations[..., None], change.frames.root[..., None])
+    none = jax.tree.map(jnp.zeros_like, inputs)
+    if static.chained:
+        begun, before = _earlier(none, change.first.pose, known), _earlier(inputs, change.first.before, known)
+    else:
+        begun, before = none, none
+    b = jax.vmap(moves)(asked.frames, places, factors, (change.frames, begun, before))
     step = _times(response, b)
     if static.chained:
-        step = _chain(asked, numbers, static, places, known, factors, response, step, change.first.pose)
+        step = _chain(asked, numbers, static, places, known, factors, response, step)
 
     def move(pose: Pose, offsets: Array, by: Array) -> Pose:
         parent = parent_rotations(asked.chain, forward(asked.chain, pose, offsets))
@@ -211,41 +213,35 @@ def _chain(
     factors: Factors,
     response: Float[Array, "f n n"],
     step: Float[Array, "f n"],
-    first: Pose,
 ) -> Float[Array, "f n"]:
     """Each frame's step with what the step of the frame before it adds: one linear recurrence over the clip."""
     free = asked.chain._replace(limits=None)
     offsets = _earlier_rows(asked.frames.offsets, known)
+    joints = (step.shape[1] - 3) // 3
 
-    def through(frame: Frames, at: Solved, factors: Factors, response: Array, offsets: Array) -> Array:
-        parent = parent_rotations(asked.chain, forward(asked.chain, at.last, offsets))
+    def through(frame: Frames, at: Solved, before: Array) -> tuple[Array, Array]:
+        """How `from_start` moves with the pose before, (1 + P, 3, 3) for the root's place and each joint: none looks at another."""
+        here = parent_rotations(asked.chain, forward(asked.chain, at.pose, frame.offsets))
+        there = parent_rotations(asked.chain, forward(asked.chain, at.last, before))
 
-        def start(s: Float[Array, " n"]) -> Float[Array, " n"]:
-            there = at._replace(last=moved(free, at.last, parent, s[:, None]))
-            return balance(asked.chain, asked.tasks, frame, there, factors, numbers, static.layers, static.kinds)
+        def start(s: Float[Array, " 3"]) -> tuple[Array, Array]:
+            last = moved(free, at.last, there, jnp.tile(s, joints + 1)[:, None])
+            return from_start(frame, at._replace(last=last), here, numbers)
 
-        by = jax.jacfwd(start)(jnp.zeros(response.shape[0], response.dtype))
-        return jnp.matmul(response, by, precision="highest")
+        back, travel = jax.jacfwd(start)(jnp.zeros(3, step.dtype))
+        return back.reshape(-1, 3, 3), travel.reshape(-1, 3, 3)
 
-    links = jax.vmap(through)(asked.frames, places, factors, response, offsets)
-    # the first frame's start is moved by the pose that the clip begins from
-    frame, at, own = jax.tree.map(lambda x: x[0], (asked.frames, places, factors))
+    blocks = jax.vmap(through)(asked.frames, places, offsets)
+    good = jnp.array([jnp.isfinite(x).all((1, 2, 3)) for x in blocks]).all(0)
+    blocks = tuple(jnp.where(good[:, None, None, None], x, 0) for x in blocks)
 
-    def begin(pose: Pose) -> Float[Array, " n"]:
-        there = at._replace(last=pose)
-        return balance(asked.chain, asked.tasks, frame, there, own, numbers, static.layers, static.kinds)
-
-    moved_first = jax.jvp(begin, (at.last,), (first,))[1]
-    step = step.at[0].add(jnp.matmul(response[0], moved_first, precision="highest"))
-    links = links.at[0].set(0)
-    links = jnp.where(jnp.isfinite(links).all((1, 2), keepdims=True), links, 0)
-
-    def follow(last: Array, x: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-        own, link, seen = x
-        here = own + link @ last
+    def follow(last: Array, x: tuple[Any, ...]) -> tuple[Array, Array]:
+        own, response, factors, blocks, seen = x
+        moves = (jnp.sum(m * last.reshape(-1, 1, 3), axis=-1).reshape(-1) for m in blocks)
+        here = own + jnp.matmul(response, of_start(factors, *moves), precision="highest")
         return jnp.where(seen, here, last), here
 
-    return jax.lax.scan(follow, jnp.zeros_like(step[0]), (step, links, known))[1]
+    return jax.lax.scan(follow, jnp.zeros_like(step[0]), (step, response, factors, blocks, known))[1]
 
 
 def _earlier_rows(x: Float[Array, "f p 3"], known: Bool[Array, " f"]) -> Float[Array, "f p 3"]:

@@ -205,6 +205,29 @@ def jacobian(chain: Chain, tasks: Tasks, goals: Goals, world: World, seen: Seen,
     return jnp.concatenate([root.reshape(rows, 3), columns.reshape(rows, 3 * joints)], axis=1)
 
 
+def wrench(
+    chain: Chain, tasks: Tasks, goals: Goals, world: World, seen: Seen, kinds: Kinds, load: Float[Array, "m k"]
+) -> Float[Array, "n k"]:
+    """`J' load` for several loads on the rows, without the Jacobian `J`: forces at the points, and their moments about the joints."""
+    joints = world.shape[0] - 1
+    arm, body, rootward = _levers(chain, tasks, seen, world[:joints, :, 3, 0])
+    directions, turns = _directions(tasks, goals, seen, kinds)
+    load = load.reshape(-1, 3, load.shape[-1]) * _scale(tasks, goals)[:, :, None]
+
+    def at_points(axes: Float[Array, "b 3 3"]) -> Float[Array, "b 3 k"]:
+        return jnp.sum(axes[:, :, :, None] * load[:, :, None, :], axis=1)
+
+    force = at_points(directions)
+    used = tasks.recruits[:, :, None, None]
+    x, y, z = (arm[:, :, i, None] for i in range(3))
+    fx, fy, fz = (force[:, None, i] for i in range(3))
+    moment = jnp.stack([y * fz - z * fy, z * fx - x * fz, x * fy - y * fx], axis=2)  # (B, P, 3, K)
+    if turns is not None:
+        moment = moment + body[:, :, None, None] * at_points(turns)[:, None]
+    root = force * (rootward * tasks.root_recruited * goals.root_free)[:, None, None]
+    return jnp.concatenate([jnp.sum(root, axis=0), jnp.sum(moment * used, axis=0).reshape(3 * joints, -1)])
+
+
 def _levers(
     chain: Chain, tasks: Tasks, seen: Seen, p: Float[Array, "p 3"]
 ) -> tuple[Float[Array, "b p 3"], Float[Array, "b p"], Float[Array, " b"]]:

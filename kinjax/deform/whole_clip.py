@@ -55,7 +55,7 @@ class Minimum:
     steps: tried. converged: the undamped step that is left is below the tolerance (in float32, or the last step gained next
     to nothing). cost: half the sum of squares. gradient: its
     derivative with the largest size. displacement: (F, 3 + 3 J) of the root's translation and of all joints of the
-    skeleton, metres and radians.
+    skeleton, metres and radians; 0 in lost frames.
     """
 
     steps: int
@@ -213,8 +213,10 @@ def _finished(
     result = output_motion(motion, plan, solved)
     report = make_report(motion, result, plan, solved, replace(settings, iterations=tried), 1)
     cost, slope = float(found.cost), float(found.gradient)
-    way, turn = displacement(motion, result)
-    whole = np.concatenate([way[:, None], turn], axis=1).reshape(count, -1)
+    whole = np.zeros((count, 1 + len(motion.skeleton.names), 3))
+    u = np.asarray(found.value, float)[:count].reshape(count, -1, 3)
+    whole[:, 0] = float(problem.root_free) * u[:, 0]
+    whole[:, 1 + plan.kept[free]] = u[:, 1 : 1 + len(free)]
     note = f"all frames at once: {tried} steps, {'a minimum' if done else 'not a minimum yet'}, largest gradient {slope:.1e}"
     report = replace(report, notes=(*report.notes, note))
-    return Deformation(result, report, Minimum(tried, done, cost, slope, whole))
+    return Deformation(result, report, Minimum(tried, done, cost, slope, whole.reshape(count, -1)))
