@@ -42,7 +42,7 @@ _ROOMS = {
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 
-_SUBMODULES = ("database", "deform", "detect", "evaluation", "formats", "kinematics", "plots", "report", "synthetic")
+_SUBMODULES = ("database", "deform", "detect", "evaluation", "formats", "kinematics", "plots", "report", "soft", "synthetic")
 
 __all__ = ["__version__", *sorted(_HOME), *_SUBMODULES]
 

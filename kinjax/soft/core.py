@@ -25,7 +25,7 @@ from .body import joint_poses
 from .instantaneous import Limits, soft_instantaneous
 from .lmeds import soft_lmeds
 from .merging import frames_and_edges, soft_merge, soft_opening
-from .parts import Parts, conjugate, matrix_elements, mean_pose, normalize, vector_of_product
+from .parts import Parts, conjugate, held, matrix_elements, mean_pose, normalize, vector_of_product
 from .quantile import smooth_quantile
 from .settling import soft_settle
 from .steps import smooth_maximum, smooth_minimum
@@ -84,12 +84,14 @@ def run(
     """Steps 1 to 6, softly, on padded arrays. `given` thresholds take the place of templates."""
     paper = plan.method == "paper"
     q, t, valid = joint_poses(source) if isinstance(source, Joints) else _seen(source)
+    never = jax.lax.stop_gradient(q[0][0, 0]) > 2  # a component of a unit quaternion; the compiler does not know
+    q, t = held((q, t), never)
     if not paper:
         fixed = jax.lax.stop_gradient((jnp.stack(q), jnp.stack(t)))
-        valid = valid & ~spikes(*fixed, valid, plan.hampel, numbers.spike, numbers.rate < 0)
+        valid = valid & ~spikes(*fixed, valid, plan.hampel, numbers.spike, never)
     zero = jnp.zeros_like(t[0][:, 0])
     noise = (zero, zero) if paper else data_noise(q, t, valid, temperature)
-    mean = (q, t) if paper else mean_pose(q, t, valid, plan.mean)
+    mean = (q, t) if paper else held(mean_pose(q, t, valid, plan.mean), never)
     k, n = plan.span, (valid.shape[-1] - plan.span) // BLOCK * BLOCK  # what is cut off is padding
     first, second = ([tuple(x[:, i : i + n] for x in y) for y in mean] for i in (0, k))
     seen = valid[:, :n] & valid[:, k : k + n]

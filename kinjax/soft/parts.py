@@ -6,6 +6,8 @@ there a stack of components costs nothing, but the gradient of taking one apart 
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -14,6 +16,12 @@ from ..detect.displacements import shifted
 from ..rotations import dot
 
 Parts = tuple[Float[Array, "..."], ...]
+
+
+def held(x: Any, never: Bool[Array, ""]) -> Any:
+    """`x`, computed before anything reads it, and its gradient before anything that leads to it: `numerics.computed_once` for
+    what is differentiated. `never`: False, which the compiler must not know; a branch is where it stops merging loops."""
+    return jax.lax.cond(never, lambda y: jax.tree.map(lambda z: jnp.roll(z, 1, axis=-1), y), lambda y: y, x)
 
 
 def multiply(a: Parts, b: Parts) -> Parts:

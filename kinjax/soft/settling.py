@@ -45,6 +45,7 @@ def soft_settle(
     def unreached(edge: Array, at: int, way: int, offset: int) -> Array:
         home_q, home_t = (tuple(x[at : at + n] for x in y) for y in mean)
 
+        @jax.checkpoint
         def step(grown: Array, m: Array) -> tuple[Array, Array]:
             take = lambda x: jax.lax.dynamic_slice(x, (pad + offset + way * m,), (n,))  # noqa: E731
             apart = [take(a) - b for a, b in zip(t, home_t, strict=True)]
