@@ -35,7 +35,7 @@ def main() -> None:
     from kinjax.synthetic import walking_biped
 
     walk = walking_biped(rate=60, steps=4).motion
-    motion = walk.slice(0, 240)
+    motion = walk.slice(0, 239)
     goals = [
         Position("LeftFoot", priority=2),
         Position("RightFoot", priority=2),
@@ -70,7 +70,7 @@ def main() -> None:
         f"whole_clip over deform, warm: {warm['whole_clip, float64'] / warm['deform, as it is']:.1f} "
         f"in float64, {warm['whole_clip, float32'] / warm['deform, as it is']:.1f} in float32"
     )
-    dense(walk.slice(90, 120), [*goals[:2], Position("LeftHand", offset=(0.05, 0.1, 0.1), begin=10, end=20)])
+    dense(walk.slice(90, 119), [*goals[:2], Position("LeftHand", offset=(0.05, 0.1, 0.1), begin=10, end=20)])
 
 
 def dense(motion, goals, steps: int = 5) -> None:

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..rotations import exp
 from .banded import Bands, times
 from .chain import Chain, Pose, compose, forward, parent_rotations
 from .sequence import Frames
@@ -38,11 +37,14 @@ class Errors(NamedTuple):
     acceleration: Float[Array, "f n"]
 
 
-class Linear(NamedTuple):
-    """How each frame's 3 B constraint residuals grow with its displacement, and the gradient of half the sum of all squares."""
+class Local(NamedTuple):
+    """How each frame's 3 B constraint residuals grow with its displacement; of half the sum of all squares, the gradient and the
+    second derivatives; turning: those of the residuals' part in them, without which it is the Gauss-Newton matrix."""
 
     jac: Float[Array, "f m n"]
     gradient: Float[Array, "f n"]
+    bands: Bands
+    turning: Float[Array, "f n n"]
 
 
 class Problem(NamedTuple):
@@ -64,7 +66,7 @@ class Problem(NamedTuple):
     def pose(self, frame: Frames, u: Float[Array, " n"]) -> Pose:
         """One frame's input, displaced (trials C = 1)."""
         turn = jnp.matmul(self.spread, u[3:].reshape(-1, 3), precision="highest")
-        q = compose(exp(turn.T), frame.rotations)
+        q = compose(quaternion_of(turn).T, frame.rotations)
         return Pose(q[..., None], (frame.root + self.root_free * u[:3])[:, None])
 
     def asked(self, kinds: Kinds, frame: Frames, u: Float[Array, " n"]) -> Float[Array, "b 3"]:
@@ -81,20 +83,23 @@ class Problem(NamedTuple):
         w = self.weights
         return Errors(own, w.attraction * u, w.velocity * pairs * step, w.acceleration * triples * bend)
 
-    def linear(self, kinds: Kinds, u: Float[Array, "f n"]) -> Linear:
-        """Jacobian and gradient."""
+    def local(self, kinds: Kinds, u: Float[Array, "f n"]) -> Local:
+        """Jacobian, gradient and matrix of second derivatives."""
 
-        def both(frame: Frames, at: Float[Array, " n"]) -> tuple[Array, Array]:
-            jac, r = self.jacobian(kinds, frame, at)
-            return jac, jnp.matmul(r, jac, precision="highest")
+        def all_of(frame: Frames, at: Float[Array, " n"]) -> tuple[Array, Array, Array]:
+            def slope(x: Float[Array, " n"]) -> tuple[Array, tuple[Array, Array]]:
+                jac, r = self.jacobian(kinds, frame, x)
+                own = jnp.matmul(r, jac, precision="highest")
+                return own, (jac, own)
 
-        jac, gradient = jax.vmap(both)(self.frames, u)
-        return Linear(jac, gradient + times(self._smoothness(u.shape[1]), u))
+            hessian, (jac, own) = jax.jacfwd(slope, has_aux=True)(at)
+            return jac, own, (hessian + hessian.T) / 2
 
-    def curvature(self, jac: Float[Array, "f m n"]) -> Bands:
-        """The Gauss-Newton matrix of half the sum of squares."""
-        smooth = self._smoothness(jac.shape[-1])
-        return smooth._replace(diagonal=smooth.diagonal + jnp.einsum("fmi,fmj->fij", jac, jac, precision="highest"))
+        jac, gradient, hessian = jax.vmap(all_of)(self.frames, u)
+        smooth = self._smoothness(u.shape[1])
+        bands = smooth._replace(diagonal=smooth.diagonal + hessian)
+        turning = hessian - jnp.einsum("fmi,fmj->fij", jac, jac, precision="highest")
+        return Local(jac, gradient + times(smooth, u), bands, turning)
 
     def bend(self, kinds: Kinds, u: Float[Array, "f n"], way: Float[Array, "f n"]) -> Float[Array, "f b 3"]:
         """The second derivative of the constraints' residuals along a way; that of the other terms is 0."""
@@ -165,6 +170,16 @@ class Problem(NamedTuple):
 def _cross(v: Float[Array, "*any 3"]) -> Float[Array, "*any 3 3"]:
     """The matrix of `v x`."""
     return jnp.swapaxes(jnp.cross(v[..., None, :], jnp.eye(3, dtype=v.dtype)), -1, -2)
+
+
+def quaternion_of(v: Float[Array, "*any 3"]) -> Float[Array, "*any 4"]:
+    """Quaternions of rotation vectors, with the second derivatives at no turn, too, from where every solve starts."""
+    square = jnp.sum(v * v, axis=-1, keepdims=True)
+    small = square < 1e-3
+    angle = jnp.sqrt(jnp.where(small, 1, square))
+    w = jnp.where(small, 1 - square / 8 + square * square / 384, jnp.cos(angle / 2))
+    factor = jnp.where(small, 0.5 - square / 48 + square * square / 3840, jnp.sin(angle / 2) / angle)
+    return jnp.concatenate([w, factor * v], axis=-1)
 
 
 def left_jacobian(v: Float[Array, "*any 3"]) -> Float[Array, "*any 3 3"]:

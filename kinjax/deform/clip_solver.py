@@ -1,6 +1,6 @@
 """Levenberg-Marquardt for the problem of a whole clip: optimistix' loop around banded linear steps.
 
-In: a `Problem` that gives its errors, its Gauss-Newton matrix and its gradient, and a start. Out: `Found`. The matrix is kept by its
+In: a `Problem` that gives its errors and their derivatives, and a start. Out: `Found`. The matrix is kept by its
 bands (`banded`), never as a Jacobian of the clip. Own are the descent (the damped banded solve), where the trust region
 starts, and when to stop; the loop and the acceptance of steps are `optimistix.AbstractGaussNewton`'s.
 """
@@ -17,7 +17,8 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from ..numerics import safe_divide
-from .banded import factorize, solve
+from .banded import Factors, factorize, solve
+from .clip_problem import Local
 from .tasks import Kinds
 
 FIRST = 1e4
@@ -27,7 +28,7 @@ FLOOR = 2.0
 """Damping is at least so many rounding errors of the largest curvature."""
 
 
-LITTLE, MUCH, FASTER = 0.01, 0.75, 10.0
+LITTLE, MUCH, FASTER = 0.01, 0.75, 5.0
 """A step is taken that gains the share LITTLE of what was hoped for; the step size grows by FASTER where it gains MUCH, and
 shrinks by it where the step is refused."""
 
@@ -52,13 +53,12 @@ class Found(NamedTuple):
     converged: Bool[Array, ""]
 
 
-class Local(eqx.Module):
-    """The model at the last accepted displacements `at`, how far those before were (`moved`, largest entry), a bound of its
-    curvature (`most`), the `cost` and what was `gained` by the last step."""
+class Model(eqx.Module):
+    """What is known at the last accepted displacements `at`: `local` derivatives, how far those before were (`moved`, largest
+    entry), a bound of the curvature (`most`), the `cost` and what was `gained` by the last step."""
 
     at: Array
-    jac: Array
-    gradient: Array
+    local: Local
     moved: Array
     most: Array
     cost: Array
@@ -71,44 +71,52 @@ def damping_of(step_size: Array, most: Array) -> Array:
 
 
 class BandedDescent(optx.AbstractDescent):
-    """The step `v = -(A + d I)^-1 g` of damping `d = 1 / step_size`, by block Cholesky, and along its parabola.
+    """The step `v = -(H + d I)^-1 g` of damping `d = 1 / step_size`, by block Cholesky, and along its parabola.
+
+    `H` has the second derivatives of the residuals in it, where it is positive definite with them (near a minimum): along the
+    valley below they are as large as the weak terms that decide there, and by the Gauss-Newton matrix alone steps swing
+    from side to side. Elsewhere it is that matrix.
 
     The minimum lies in a narrow curved valley: weak terms along it, the constraints across. So half of the acceleration
-    `-(A + d I)^-1 J' r''(v, v)` is added to the step: it bends the way so that the residuals stay as the linear model has
+    `-(H + d I)^-1 J' r''(v, v)` is added to the step: it bends the way so that the residuals stay as the linear model has
     them (geodesic acceleration, Transtrum and Sethna 2012), for one more solve with the same factors.
     """
 
     problem: Any
     kinds: Kinds = eqx.field(static=True)
 
-    def init(self, y: Any, f_info_struct: Any) -> Local:
-        rows = 3 * self.problem.tasks.kind.shape[0]
-        jac = jnp.zeros((y.shape[0], rows, y.shape[1]), y.dtype)
+    def init(self, y: Any, f_info_struct: Any) -> Model:
+        like = jax.eval_shape(lambda u: self.problem.local(self.kinds, u), y)
         none = jnp.zeros((), y.dtype)
-        return Local(y, jac, jnp.zeros_like(y), none, none, none, none)
+        return Model(y, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like), none, none, none, none)
 
-    def query(self, y: Any, f_info: Any, state: Local) -> Local:
-        jac, gradient = self.problem.linear(self.kinds, y)
-        most = 4 * jnp.max(jnp.sum(jnp.abs(self.problem.curvature(jac).diagonal), axis=-1))
+    def query(self, y: Any, f_info: Any, state: Model) -> Model:
+        local = self.problem.local(self.kinds, y)
+        most = 4 * jnp.max(jnp.sum(jnp.abs(local.bands.diagonal), axis=-1))
         cost = f_info.as_min()
-        return Local(y, jac, gradient, jnp.max(jnp.abs(y - state.at)), most, cost, state.cost - cost)
+        return Model(y, local, jnp.max(jnp.abs(y - state.at)), most, cost, state.cost - cost)
 
-    def step(self, step_size: Any, state: Local) -> Any:
-        bands = self.problem.curvature(state.jac)
-        diagonal = bands.diagonal
-        same = jnp.eye(diagonal.shape[1], dtype=diagonal.dtype)
+    def step(self, step_size: Any, state: Model) -> Any:
+        jac, gradient, bands, _ = state.local
         damping = damping_of(step_size, state.most)
-        factors = factorize(bands._replace(diagonal=diagonal + damping * same))
-        straight = -solve(factors, state.gradient)
-        bend = self.problem.bend(self.kinds, state.at, straight).reshape(state.jac.shape[:2])
-        aside = -solve(factors, jnp.einsum("fm,fmn->fn", bend, state.jac, precision="highest")) / 2
+        same = jnp.eye(jac.shape[-1], dtype=jac.dtype)
+        newton = factorize(bands._replace(diagonal=bands.diagonal + damping * same))
+
+        def gauss() -> Factors:
+            diagonal = bands.diagonal - state.local.turning + damping * same
+            return factorize(bands._replace(diagonal=diagonal))
+
+        factors = jax.lax.cond(newton.sound, lambda: newton, gauss)
+        straight = -solve(factors, gradient)
+        bend = self.problem.bend(self.kinds, state.at, straight).reshape(jac.shape[:2])
+        aside = -solve(factors, jnp.einsum("fm,fmn->fn", bend, jac, precision="highest")) / 2
         # half turns and more look near to rotations, and are far: no step is so long
         short = jnp.minimum(1, safe_divide(LONGEST * jnp.ones_like(damping), jnp.max(jnp.abs(straight))))
         short = jnp.where(short > 0, short, 1)
         usable = short**2 * jnp.sum(aside * aside) <= MOST_ASIDE**2 * jnp.sum(straight * straight)
         step = short * straight + jnp.where(usable, short**2 * aside, 0)
-        # where rounding leaves the matrix not positive definite: a way up, which is refused, and more damping follows
-        up = state.gradient / (damping + state.most)
+        # where rounding leaves neither positive definite: a way up, which is refused, and more damping follows
+        up = gradient / (damping + state.most)
         return jnp.where(factors.sound, step, up), optx.RESULTS.successful
 
 
@@ -134,7 +142,7 @@ class TrustRegion(optx.AbstractSearch):
         hoped = sum((jnp.sum(x * x) for x in ahead[1:]), jnp.sum(ahead[0] * ahead[0])) / 2 - before
         level = FLOOR * jnp.finfo(now.dtype).eps * before
         equal = (jnp.abs(now - before) <= level) & (jnp.abs(hoped) <= level)
-        taken = (now - before <= LITTLE * hoped) | equal | first_step
+        taken = ((now < before) & (now - before <= LITTLE * hoped)) | equal | first_step
         good = (now - before < MUCH * hoped) & (hoped < 0) & ~first_step
         size = state * jnp.where(good, FASTER, jnp.where(taken, 1, 1 / FASTER))
         return size, taken, optx.RESULTS.successful, size
@@ -161,11 +169,11 @@ class BandedLevenbergMarquardt(optx.AbstractGaussNewton):
     def converged(self, state: Any) -> Any:
         """Whether the last trial was accepted and led to nothing new."""
         taken = (state.num_steps_since_acceptance == 0) & (state.num_accepted_steps > 1)
-        local = state.descent_state
-        damping = damping_of(state.search_state / FASTER, local.most)
-        short = local.moved * (1 + damping / self.least) < self.tolerance
-        blunt = FLOOR * jnp.finfo(local.most.dtype).eps * local.most > self.least
-        return taken & (short | (blunt & (local.gained <= SLOW * local.cost)))
+        model = state.descent_state
+        damping = damping_of(state.search_state / FASTER, model.most)
+        short = model.moved * (1 + damping / self.least) < self.tolerance
+        blunt = FLOOR * jnp.finfo(model.most.dtype).eps * model.most > self.least
+        return taken & (short | (blunt & (model.gained <= SLOW * model.cost)))
 
     def terminate(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> Any:
         return self.converged(state) | (state.num_steps > self.steps), state.result
@@ -187,7 +195,7 @@ def minimise(problem: Any, kinds: Kinds, start: Array, steps: Array, tolerance: 
     got: Any = optx.least_squares(lambda u, p: p.errors(kinds, u), solver, start, problem, max_steps=None, throw=False)
     left = problem.errors(kinds, got.value)
     cost = sum((jnp.sum(x * x) for x in left[1:]), jnp.sum(left[0] * left[0])) / 2
-    gradient = jnp.max(jnp.abs(problem.linear(kinds, got.value).gradient))
+    gradient = jnp.max(jnp.abs(problem.local(kinds, got.value).gradient))
     return Found(got.value, cost, gradient, got.stats["num_steps"], solver.converged(got.state))
 
 
