@@ -19,6 +19,10 @@ from .sequence import Frames
 from .tasks import Kinds, Tasks, _levers, look, residuals
 
 
+TOGETHER = 32
+"""Frames whose second derivatives are worked out at once."""
+
+
 class Weights(NamedTuple):
     """Of the terms: attraction (metres a radian), velocity (times the rate: metres a radian a frame) and acceleration (times its
     square)."""
@@ -86,7 +90,9 @@ class Problem(NamedTuple):
     def local(self, kinds: Kinds, u: Float[Array, "f n"]) -> Local:
         """Jacobian, gradient and matrix of second derivatives."""
 
-        def all_of(frame: Frames, at: Float[Array, " n"]) -> tuple[Array, Array, Array]:
+        def all_of(x: tuple[Frames, Array]) -> tuple[Array, Array, Array]:
+            frame, at = x
+
             def slope(x: Float[Array, " n"]) -> tuple[Array, tuple[Array, Array]]:
                 jac, r = self.jacobian(kinds, frame, x)
                 own = jnp.matmul(r, jac, precision="highest")
@@ -95,7 +101,8 @@ class Problem(NamedTuple):
             hessian, (jac, own) = jax.jacfwd(slope, has_aux=True)(at)
             return jac, own, (hessian + hessian.T) / 2
 
-        jac, gradient, hessian = jax.vmap(all_of)(self.frames, u)
+        # some at a time: on the way to its n x n matrix a frame takes 3 B times as much
+        jac, gradient, hessian = jax.lax.map(all_of, (self.frames, u), batch_size=TOGETHER)
         smooth = self._smoothness(u.shape[1])
         bands = smooth._replace(diagonal=smooth.diagonal + hessian)
         turning = hessian - jnp.einsum("fmi,fmj->fij", jac, jac, precision="highest")

@@ -24,7 +24,7 @@ from .chain import Chain, Pose, World, forward, moved, parent_rotations
 from .frame_solver import Reference, attraction
 from .prioritized import Basis, inverse, row_basis, times
 from .sequence import Frames, displaced
-from .tasks import CENTER_OF_MASS, Kinds, Tasks, jacobian, look, residuals, wrench
+from .tasks import CENTER_OF_MASS, Kinds, Tasks, jacobian, look, residuals, stiffness, wrench
 
 FAINT = 0.02
 """Directions in which a layer moves less than this share of its rows' root mean square length are held back: there the
@@ -171,7 +171,26 @@ def derivative(
     layers: int,
     kinds: Kinds,
 ) -> Float[Array, "n n"]:
-    """How `balance` changes with a step of the pose, along world axes; along faint directions it counts as if they moved."""
+    """How `balance` changes with a step of the pose, along world axes; along faint directions it counts as if they moved.
+
+    In closed form where all constraints are in the world and none is a look-at, else by `jacfwd`.
+    """
+    form = _by_jacfwd if kinds.relative or kinds.looks else _in_closed_form
+    change = form(chain, tasks, frame, at, factors, numbers, layers, kinds)
+    q = factors.basis.rows
+    return change - times(q.T, times(factors.solve, times(factors.hold - factors.dragged, q)))
+
+
+def _by_jacfwd(
+    chain: Chain,
+    tasks: Tasks,
+    frame: Frames,
+    at: Solved,
+    factors: Factors,
+    numbers: Numbers,
+    layers: int,
+    kinds: Kinds,
+) -> Float[Array, "n n"]:
     world = forward(chain, at.pose, frame.offsets)
     parent = parent_rotations(chain, world)
     free = chain._replace(limits=None)
@@ -183,9 +202,67 @@ def derivative(
         past = from_start(frame, at._replace(pose=pose), parent_rotations(chain, there), numbers)
         return own + of_start(factors, *past)
 
-    q = factors.basis.rows
-    faint = times(factors.solve, times(factors.hold - factors.dragged, q))
-    return jax.jacfwd(after)(jnp.zeros(3 + 3 * parent.shape[0], parent.dtype)) - times(q.T, faint)
+    return jax.jacfwd(after)(jnp.zeros(3 + 3 * parent.shape[0], parent.dtype))
+
+
+def _in_closed_form(
+    chain: Chain,
+    tasks: Tasks,
+    frame: Frames,
+    at: Solved,
+    factors: Factors,
+    numbers: Numbers,
+    layers: int,
+    kinds: Kinds,
+) -> Float[Array, "n n"]:
+    world = forward(chain, at.pose, frame.offsets)
+    parent = parent_rotations(chain, world)
+    seen = look(tasks, frame.goals, world)
+    r = residuals(tasks, frame.goals, seen, kinds).reshape(-1)
+    rows = jnp.repeat(tasks.layer, 3)
+    q, factors_r = factors.basis
+    member = _members(rows, layers, r.dtype)
+    load = jnp.concatenate([r[:, None] * member, jnp.zeros_like(r[:, None])], axis=1) - factors.multipliers.T
+    bent = stiffness(chain, tasks, frame.goals, world, seen, kinds, load)  # (N + 1, n, n)
+    # residuals change with every joint that moves them, recruited or not
+    all_joints = tasks._replace(
+        recruits=jnp.ones_like(tasks.recruits), root_recruited=jnp.ones_like(tasks.root_recruited)
+    )
+    free_goals = frame.goals._replace(root_free=jnp.ones_like(frame.goals.root_free))
+    every = jacobian(chain, all_joints, free_goals, world, seen, kinds)
+    same = (rows[:, None] == rows[None, :]).astype(r.dtype)
+    curved = jnp.einsum("mn,ml,lnk->mk", q, member, bent[:layers], precision="highest")
+    own = curved - jnp.matmul((factors_r * same).T, every, precision="highest")
+    stays, stays_root = _staying(frame, numbers)
+    reference = Reference(frame.rotations, frame.root, jnp.ones_like(stays), jnp.ones_like(stays_root))
+    ways = attraction(reference, at.pose, parent), -from_start(frame, at, parent, numbers)[1]
+    pulls = [_attraction_change(chain, z) for z in ways]
+    mixed = jnp.concatenate([jnp.repeat(stays_root, 3), jnp.repeat(stays, 3)])[:, None]
+    free = (1 - mixed) * pulls[0] + mixed * pulls[1] + bent[layers]
+    travelled = times(factors.dragged, jnp.matmul(q, pulls[1], precision="highest"))
+    inner = times(factors.solve, own + travelled) - jnp.matmul(q, free, precision="highest")
+    return free + jnp.matmul(q.T, inner, precision="highest")
+
+
+def _attraction_change(chain: Chain, z: Float[Array, " n"]) -> Float[Array, "n n"]:
+    """How the attraction `z` to a fixed pose changes with a step: the root's by minus the step, a joint's by minus the inverse of
+    the right Jacobian of its rotation vector, and it is carried along by the joints above."""
+    v = z[3:].reshape(-1, 3)
+    joints = v.shape[0]
+    angle2 = jnp.sum(v * v, axis=1)
+    small = angle2 < 1e-6
+    angle = jnp.sqrt(jnp.where(small, 1, angle2))
+    series = jnp.asarray(1 / 12, z.dtype) + angle2 / 720
+    c = jnp.where(small, series, (1 - angle / 2 / jnp.tan(angle / 2)) / jnp.where(small, 1, angle2))
+    eye = jnp.eye(3, dtype=z.dtype)
+    hat = jnp.stack([_cross(jnp.broadcast_to(e, v.shape), v) for e in eye], axis=2)  # t -> t x v, that is -[v]x
+    square = v[:, :, None] * v[:, None, :] - angle2[:, None, None] * eye
+    own = -(eye - hat / 2 + c[:, None, None] * square)
+    strict = chain.above - jnp.eye(joints, dtype=z.dtype)
+    turned = strict[:, None, :, None] * hat[:, :, None, :] + jnp.eye(joints, dtype=z.dtype)[:, None, :, None] * own[:, :, None]
+    n = 3 * joints
+    out = jnp.zeros((3 + n, 3 + n), z.dtype).at[:3, :3].set(-eye)
+    return out.at[3:, 3:].set(turned.reshape(n, n))
 
 
 def nearby(chain: Chain, world: World, step: Float[Array, " n"]) -> World:

@@ -10,18 +10,23 @@ Frames that were not solved are the input's, and so are their derivatives; what 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..errors import OptionError
 from .chain import Chain, Pose, forward, moved, parent_rotations
 from .conditions import Factors, Numbers, Solved, balance, derivative, factors_of, from_start, of_start
 from .sequence import Carried, Frames
 from .tasks import Kinds, Tasks
+
+
+TOGETHER = 16
+"""Frames that are differentiated at once."""
 
 
 class Asked(NamedTuple):
@@ -61,8 +66,8 @@ def _attached(static: Static, primals: Any, tangents: Any) -> tuple[Poses, Poses
     change = tangents[0]
     places, known = _places(asked, poses, sound)
     asked, change = _finite(asked, change, sound & known)
-    factors, response = jax.vmap(lambda frame, at: _frame(asked.chain, asked.tasks, frame, at, numbers, static))(
-        asked.frames, places
+    factors, response = _each(
+        lambda frame, at: _frame(asked.chain, asked.tasks, frame, at, numbers, static), asked.frames, places
     )
 
     def moves(frame: Frames, at: Solved, factors: Factors, by: Any) -> Float[Array, " n"]:
@@ -82,8 +87,8 @@ def _attached(static: Static, primals: Any, tangents: Any) -> tuple[Poses, Poses
         begun, before = _earlier(none, change.first.pose, known), _earlier(inputs, change.first.before, known)
     else:
         begun, before = none, none
-    b = jax.vmap(moves)(asked.frames, places, factors, (change.frames, begun, before))
-    step = _times(response, b)
+    b = _each(moves, asked.frames, places, factors, (change.frames, begun, before))
+    step = jax.vmap(_Response.to)(response, b)
     if static.chained:
         step = _chain(asked, numbers, static, places, known, factors, response, step)
 
@@ -107,9 +112,7 @@ def distance(
     asked, numbers, poses = jax.lax.stop_gradient((asked, numbers, poses))
     places, known = _places(asked, poses, sound)
     asked, _ = _finite(asked, asked, sound & known)
-    left = jax.vmap(lambda frame, at: _left(asked.chain, asked.tasks, frame, at, numbers, static))(
-        asked.frames, places
-    )
+    left = _each(lambda frame, at: _left(asked.chain, asked.tasks, frame, at, numbers, static), asked.frames, places)
     return jnp.where(sound & known & jnp.isfinite(left), left, jnp.inf)
 
 
@@ -118,17 +121,36 @@ def _left(chain: Chain, tasks: Tasks, frame: Frames, at: Solved, numbers: Number
     return jnp.max(jnp.abs(balance(chain, tasks, frame, at, factors, numbers, static.layers, static.kinds)))
 
 
+class _Response(NamedTuple):
+    """A frame's derivative of the conditions by the pose, factorized; bad where that is not finite, or singular."""
+
+    lu: Float[Array, "*f n n"]
+    pivots: Int[Array, "*f n"]
+    good: Bool[Array, "*f"]
+
+    def to(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+        """How the pose responds to a change of the conditions, of one frame; not at all where that is not known."""
+        step = -jax.scipy.linalg.lu_solve((self.lu, self.pivots), change)
+        return jnp.where(self.good, step, 0)
+
+
 def _frame(
     chain: Chain, tasks: Tasks, frame: Frames, at: Solved, numbers: Numbers, static: Static
-) -> tuple[Factors, Float[Array, "n n"]]:
-    """Factors, and how the pose responds to a change of the conditions; 0 where that is not finite."""
+) -> tuple[Factors, _Response]:
+    """Factors, and how the pose responds."""
     factors = factors_of(chain, tasks, frame, at, numbers, static.layers, static.kinds)
-    response = -jnp.linalg.inv(derivative(chain, tasks, frame, at, factors, numbers, static.layers, static.kinds))
-    return factors, jnp.where(jnp.isfinite(response).all(), response, 0)
+    a = derivative(chain, tasks, frame, at, factors, numbers, static.layers, static.kinds)
+    identity = jnp.eye(a.shape[0], dtype=a.dtype)
+    finite = jnp.isfinite(a).all()
+    lu, pivots = jax.scipy.linalg.lu_factor(jnp.where(finite, a, -identity))
+    smallest = jnp.min(jnp.abs(jnp.diagonal(lu)))
+    good = finite & jnp.isfinite(lu).all() & (smallest > 8 * jnp.finfo(a.dtype).eps)
+    return factors, _Response(jnp.where(good, lu, identity), pivots, good)
 
 
-def _times(a: Float[Array, "f n n"], b: Float[Array, "f n"]) -> Float[Array, "f n"]:
-    return jnp.einsum("fij,fj->fi", a, b, precision="highest")
+def _each(f: Callable[..., Any], *frames: Any) -> Any:
+    """`f` of every frame, a few at a time: what it needs in between stays in the processor's cache, and out of memory."""
+    return jax.lax.map(lambda x: f(*x), frames, batch_size=TOGETHER)
 
 
 def _places(asked: Asked, poses: Poses, sound: Bool[Array, " f"]) -> tuple[Solved, Bool[Array, " f"]]:
@@ -211,7 +233,7 @@ def _chain(
     places: Solved,
     known: Bool[Array, " f"],
     factors: Factors,
-    response: Float[Array, "f n n"],
+    response: _Response,
     step: Float[Array, "f n"],
 ) -> Float[Array, "f n"]:
     """Each frame's step with what the step of the frame before it adds: one linear recurrence over the clip."""
@@ -231,14 +253,14 @@ def _chain(
         back, travel = jax.jacfwd(start)(jnp.zeros(3, step.dtype))
         return back.reshape(-1, 3, 3), travel.reshape(-1, 3, 3)
 
-    blocks = jax.vmap(through)(asked.frames, places, offsets)
+    blocks = _each(through, asked.frames, places, offsets)
     good = jnp.array([jnp.isfinite(x).all((1, 2, 3)) for x in blocks]).all(0)
     blocks = tuple(jnp.where(good[:, None, None, None], x, 0) for x in blocks)
 
     def follow(last: Array, x: tuple[Any, ...]) -> tuple[Array, Array]:
         own, response, factors, blocks, seen = x
         moves = (jnp.sum(m * last.reshape(-1, 1, 3), axis=-1).reshape(-1) for m in blocks)
-        here = own + jnp.matmul(response, of_start(factors, *moves), precision="highest")
+        here = own + response.to(of_start(factors, *moves))
         return jnp.where(seen, here, last), here
 
     return jax.lax.scan(follow, jnp.zeros_like(step[0]), (step, response, factors, blocks, known))[1]

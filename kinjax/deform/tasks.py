@@ -228,6 +228,34 @@ def wrench(
     return jnp.concatenate([jnp.sum(root, axis=0), jnp.sum(moment * used, axis=0).reshape(3 * joints, -1)])
 
 
+def stiffness(
+    chain: Chain, tasks: Tasks, goals: Goals, world: World, seen: Seen, kinds: Kinds, load: Float[Array, "m k"]
+) -> Float[Array, "k n n"]:
+    """How `wrench` changes with a step of the pose, the loads being fixed: the curvature of the constraints.
+
+    For constraints in the world, no look-at: a point's force `f` stays as it is, and an arm turns with whichever of two joints is
+    deeper, `d/dw_k (arm_j x f) = [f]x [arm_deeper]x = arm f' - (arm . f) I`.
+    """
+    joints = world.shape[0] - 1
+    arm, _, _ = _levers(chain, tasks, seen, world[:joints, :, 3, 0])
+    directions, _ = _directions(tasks, goals, seen, kinds)
+    load = load.reshape(-1, 3, load.shape[-1]) * _scale(tasks, goals)[:, :, None]
+    force = jnp.einsum("bri,brk->bki", directions, load, precision="highest")
+    along = jnp.einsum("bpi,bki->bkp", arm, force, precision="highest")
+    eye = jnp.eye(3, dtype=arm.dtype)
+    own = jnp.einsum("bj,bji,bkl->kjil", tasks.recruits, arm, force, precision="highest")
+    own = own - jnp.einsum("bj,bkj->kj", tasks.recruits, along, precision="highest")[..., None, None] * eye
+    below = jnp.einsum("bj,bpi,bkl->kjipl", tasks.recruits, arm, force, precision="highest")
+    below = below - (
+        jnp.einsum("bj,bkp->kjp", tasks.recruits, along, precision="highest")[:, :, None, :, None]
+        * eye[None, None, :, None, :]
+    )
+    strict = chain.above - jnp.eye(joints, dtype=arm.dtype)
+    turned = chain.above[None, :, None, :, None] * own[:, :, :, None] + strict.T[None, :, None, :, None] * below
+    n = 3 * joints
+    return jnp.zeros((load.shape[-1], 3 + n, 3 + n), arm.dtype).at[:, 3:, 3:].set(turned.reshape(-1, n, n))
+
+
 def _levers(
     chain: Chain, tasks: Tasks, seen: Seen, p: Float[Array, "p 3"]
 ) -> tuple[Float[Array, "b p 3"], Float[Array, "b p"], Float[Array, " b"]]:

@@ -83,7 +83,7 @@ def whole_clip(
     ratio: float = 10.0,
     velocity: float = 1e-4,
     acceleration: float = 5e-5,
-    attraction: float = 1e-3,
+    attraction: float = 5e-3,
     steps: int = 200,
     tolerance: float = 1e-5,
     start: Motion | None = None,
