@@ -14,7 +14,7 @@ from kinjax.motion import Poses
 
 def walk(frames=220, noise=0.001):
     scene = synthetic.with_noise(synthetic.walking_biped(), noise, seed=1)
-    return scene.poses.slice(0, frames - 1)
+    return scene.poses.select(["LeftFoot", "RightFoot"]).slice(0, frames - 1)
 
 
 def hard_labels(poses, **options):
@@ -43,7 +43,7 @@ def test_labels_tend_to_the_hard_ones(name):
     print(name, [f"{x:.4f}" for x in off])
     assert off[0] > off[1] > off[2] >= off[3]
     # what is left are frames whose value lies on a threshold to 1e-3 of it
-    assert off[3] < 0.004
+    assert off[3] < 0.001
 
 
 def test_a_template_teaches_the_thresholds_of_the_hard_method():
@@ -83,7 +83,7 @@ def test_gradients_through_the_whole_against_finite_differences(x64, method):
     names = ["LeftFoot", "RightFoot"]
     template = Template("LeftFoot", 20, 60)
     task = soft.prepare(motion, names, templates=[template], method=method)
-    target = direction((2, 160), 1)
+    target = direction(np.zeros((2, 160)), 1)
 
     @jax.jit
     def loss(r, x, o, w):
@@ -155,7 +155,7 @@ def test_a_body_at_rest_and_one_never_seen_have_finite_gradients(precision):
         g = position_gradient(poses, **options)
         assert np.isfinite(g).all() and (g[:, 1] == 0).all()
         labels = np.asarray(soft.detect(poses, temperature=0.1, **options).labels)
-        assert labels[0].min() > 0.99 and (labels[1] == 0).all()
+        assert labels[0].min() > 0.9 and labels[0, 2:-2].min() > 0.999 and (labels[1] == 0).all()
 
 
 def test_a_bad_clip_leaves_the_others_of_a_batch_as_they_are():
@@ -182,7 +182,7 @@ def test_scan_over_temperatures_and_padding():
     task = soft.prepare(poses)
     _, labels = jax.lax.scan(lambda c, t: (c, soft.detect(task, temperature=t).labels), 0, jnp.array([0.2, 0.05]))
     np.testing.assert_allclose(labels[1], soft.detect(task, temperature=0.05).labels, atol=1e-6)
-    longer = replace(task, clip=jax.tree.map(lambda x: np.concatenate([x, x[..., -64:]], -1), task.clip))
+    longer = replace(task, clip=jax.tree.map(lambda x: np.concatenate([x, x[..., -32:]], -1), task.clip))
 
     def f(t):
         loss = lambda x: soft.detect(replace(t, clip=t.clip._replace(t=x)), temperature=0.2).labels.mean()  # noqa: E731

@@ -66,7 +66,9 @@ def _world_jvp(primals: Any, tangents: Any) -> Any:
     turn = tuple(2 * x for x in vector_of_product(d_rotations, conjugate(rotations)))
     own = rotate(parent, turn)
     offset = (jnp.broadcast_to(d_offsets[:, k, None], (joints, frames)) for k in range(3))
-    shift = rotate(parent, tuple(o.at[translated].set(d_moving[:, k]) for k, o in enumerate(offset)))
+    shift = rotate(
+        parent, tuple(o.at[translated].set(d_moving[:, k], unique_indices=True) for k, o in enumerate(offset))
+    )
     place = tuple(w[:joints] for w in world[4:])
     rest = tuple(a - b for a, b in zip(shift, cross(own, place), strict=True))
     both = jnp.concatenate([*own, *rest], axis=-1)

@@ -62,7 +62,9 @@ def soft_settle(
         def gather(state: Array, one: Array) -> tuple[Any, None]:
             return one * shifted(state, -way, 1.0), None
 
+        # counted from the displacement's own frame: a place before the clip's begin would be lost
+        free = shifted(free, -offset, 1.0)
         out, _ = jax.lax.scan(gather, jnp.ones_like(edge), free, reverse=True)
-        return shifted(out, -(offset + way), 1.0)
+        return shifted(out, -way, 1.0)
 
     return unreached(ends, 0, 1, high), unreached(begins, span, -1, low)
