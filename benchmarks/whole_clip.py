@@ -89,7 +89,7 @@ def dense(motion, goals, steps: int = 5) -> None:
 
     with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
         plan = make_plan(motion, tuple(goals), Settings())
-        weights = Weights(*(np.asarray(x) for x in (1e-3, 1e-4 * 60, 5e-5 * 60**2)))
+        weights = Weights(*(np.asarray(x) for x in (5e-3, 1e-4 * 60, 5e-5 * 60**2)))
         problem, _ = _problem(plan, weights, 10.0, np.dtype("float64"))
         frames = motion.frames  # no padding: the dense solver would pay for it most
         problem = problem._replace(

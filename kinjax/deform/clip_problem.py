@@ -18,7 +18,6 @@ from .chain import Chain, Pose, compose, forward, parent_rotations
 from .sequence import Frames
 from .tasks import Kinds, Tasks, _levers, look, residuals
 
-
 TOGETHER = 32
 """Frames whose second derivatives are worked out at once."""
 
