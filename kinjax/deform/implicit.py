@@ -116,6 +116,45 @@ def distance(
     return jnp.where(sound & known & jnp.isfinite(left), left, jnp.inf)
 
 
+def settled(
+    asked: Asked, numbers: Numbers, poses: Poses, sound: Bool[Array, " f"], static: Static, steps: int
+) -> Poses:
+    """The poses after up to so many Newton steps on their conditions; a step that brings a frame no nearer is not taken."""
+    asked, numbers, poses = jax.lax.stop_gradient((asked, numbers, poses))
+    places, known = _places(asked, poses, sound)
+    fine = sound & known
+    clean, _ = _finite(asked, asked, fine)
+    free = clean.chain._replace(limits=None)
+
+    def frame(x: Frames, at: Solved) -> Pose:
+        def missing(pose: Pose) -> tuple[Factors, Array]:
+            there = at._replace(pose=pose)
+            factors = factors_of(clean.chain, clean.tasks, x, there, numbers, static.layers, static.kinds)
+            return factors, balance(
+                clean.chain, clean.tasks, x, there, factors, numbers, static.layers, static.kinds
+            )
+
+        def step(_: Any, state: tuple[Pose, Factors, Array]) -> tuple[Pose, Factors, Array]:
+            pose, factors, left = state
+            there = at._replace(pose=pose)
+            response = _factorized(
+                derivative(clean.chain, clean.tasks, x, there, factors, numbers, static.layers, static.kinds)
+            )
+            parent = parent_rotations(clean.chain, forward(clean.chain, pose, x.offsets))
+            tried = moved(free, pose, parent, response.to(left)[:, None])
+            new = (tried, *missing(tried))
+            better = jnp.max(jnp.abs(new[2])) < jnp.max(jnp.abs(left))
+            return jax.tree.map(lambda a, b: jnp.where(better, a, b), new, state)
+
+        return jax.lax.fori_loop(0, steps, step, (at.pose, *missing(at.pose)))[0]
+
+    new = _each(frame, clean.frames, places)
+    return Poses(
+        jnp.where(fine[:, None, None], new.rotations[..., 0], poses.rotations),
+        jnp.where(fine[:, None], new.root[..., 0], poses.root),
+    )
+
+
 def _left(chain: Chain, tasks: Tasks, frame: Frames, at: Solved, numbers: Numbers, static: Static) -> Array:
     factors = factors_of(chain, tasks, frame, at, numbers, static.layers, static.kinds)
     return jnp.max(jnp.abs(balance(chain, tasks, frame, at, factors, numbers, static.layers, static.kinds)))
@@ -140,12 +179,16 @@ def _frame(
     """Factors, and how the pose responds."""
     factors = factors_of(chain, tasks, frame, at, numbers, static.layers, static.kinds)
     a = derivative(chain, tasks, frame, at, factors, numbers, static.layers, static.kinds)
+    return factors, _factorized(a)
+
+
+def _factorized(a: Float[Array, "n n"]) -> _Response:
     identity = jnp.eye(a.shape[0], dtype=a.dtype)
     finite = jnp.isfinite(a).all()
     lu, pivots = jax.scipy.linalg.lu_factor(jnp.where(finite, a, -identity))
     smallest = jnp.min(jnp.abs(jnp.diagonal(lu)))
     good = finite & jnp.isfinite(lu).all() & (smallest > 8 * jnp.finfo(a.dtype).eps)
-    return factors, _Response(jnp.where(good, lu, identity), pivots, good)
+    return _Response(jnp.where(good, lu, identity), pivots, good)
 
 
 def _each(f: Callable[..., Any], *frames: Any) -> Any:

@@ -271,7 +271,7 @@ def _levers(
         beside = tasks.beside[tasks.centers][:, :, None] * (x[tasks.centers][:, None, :] - p[None])
         arm = arm.at[tasks.centers].set(carried - beside)
         # the root moves what its turn moves
-        rootward = rootward.at[tasks.centers].multiply(jnp.sum(tasks.carried[:, 0], axis=1))
+        rootward = rootward.at[tasks.centers].multiply(jnp.sum(tasks.carried[:, 0], axis=1), unique_indices=True)
     return arm, moves, rootward
 
 
