@@ -31,10 +31,10 @@ IN_THE_WORLD = [
 ]
 ON_THE_BODY = [
     Position("LeftFoot", priority=2),
-    Position("LeftHand", relative_to="Spine", offset=(0.05, 0.02, 0.0), priority=1),
+    Position("LeftHand", relative_to="Spine", offset=(0.03, -0.06, 0.02), priority=1),
     LookAt("Head", axis=(1, 0, 0), at=(3.0, 0.5, 1.5), priority=1),
-    Position("RightHand", offset=(0.03, 0.0, 0.02), priority=1),
-    Position("RightHand", offset=(-0.02, 0.03, 0.0), weight=0.5, priority=1),  # both cannot be
+    Position("RightHand", offset=(0.03, 0.06, 0.02), priority=1),
+    Position("RightHand", offset=(-0.01, 0.08, 0.0), weight=0.5, priority=1),  # both cannot be
 ]
 ALL = ("place", "rotation", "weight", "offsets", "rotations", "translations", "masses")
 
@@ -145,7 +145,7 @@ def reach(offset, gradient: str = "implicit", bend_by: float = 0.5, **more) -> B
     goals = [
         Position("Base", priority=3),
         Position("Tip", offset=offset, priority=2, recruits=held),
-        Position("Elbow", offset=(0.02, 0, 0), axes="x", priority=1),
+        Position("Elbow", offset=(0.02 * any(offset), 0, 0), axes="x", priority=1),
     ]
     return Bend(arm(bend_by), goals, replace(EXACT, **more), gradient=gradient)
 
@@ -227,7 +227,7 @@ def test_a_bad_clip_of_a_batch_leaves_the_others(x64):
     for name in ALL:
         one, two = (np.asarray(getattr(g, name)) for g in (good, beside))
         np.testing.assert_array_equal(one[[0, 2]], two[[0, 2]])
-        assert np.isfinite(two).all()
+        assert np.isfinite(one).all()
     alone = jax.grad(loss)(bend.variables)
     np.testing.assert_allclose(good.place[0], alone.place, atol=1e-10)
 
@@ -240,7 +240,9 @@ def test_closed_form_is_the_derivative(x64, monkeypatch, attract):
     def left(chain, tasks, frame, at, numbers, static):
         factors = holds.factors_of(chain, tasks, frame, at, numbers, static.layers, static.kinds)
         args = chain, tasks, frame, at, factors, numbers, static.layers, static.kinds
-        jax.debug.callback(lambda *x: seen.append(x), holds._in_closed_form(*args), holds._by_jacfwd(*args))
+        one, two = holds._in_closed_form(*args), holds._by_jacfwd(*args)
+        size = jnp.max(jnp.abs(two + jnp.eye(two.shape[0])))
+        jax.debug.callback(lambda *x: seen.append(x), jnp.max(jnp.abs(one - two)) / (1 + size), size)
         return jnp.zeros(())
 
     monkeypatch.setattr(implicit, "_left", left)
@@ -251,9 +253,8 @@ def test_closed_form_is_the_derivative(x64, monkeypatch, attract):
     jax.effects_barrier()
     jax.clear_caches()
     assert len(seen) >= FRAMES
-    for one, two in seen:
-        np.testing.assert_allclose(one, two, atol=1e-11 * np.abs(two).max())
-    assert max(np.abs(np.asarray(x[1]) + np.eye(len(x[1]))).max() for x in seen) > 0.1
+    assert max(gap for gap, _ in seen) < 1e-13
+    assert max(size for _, size in seen) > 0.1
 
 
 def test_clips_of_many_lengths_share_a_program(x64):

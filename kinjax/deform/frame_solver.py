@@ -228,7 +228,8 @@ class _Iteration:
         y = correct(r0, clamp=solving.clamp * s.trust[rows], drag=True)
         parent = parent_rotations(self.chain, s.world)
         z = outside(factors.basis, attraction(self.reference, s.pose, parent))
-        z = z * jnp.minimum(1, safe_divide(safe_sqrt(solving.budget**2 - y @ y), safe_sqrt(z @ z)))
+        left, asked = safe_sqrt(solving.budget**2 - y @ y), safe_sqrt(z @ z)
+        z = z * jnp.where(asked > left, safe_divide(left, asked), jnp.ones_like(asked))
         # candidates: all layers with z, with less of it, then all without it, all but the last, ..., the first alone
         pulls = len(PULLS)
         last = jnp.concatenate([jnp.full((pulls,), layers, jnp.int32), jnp.arange(layers, 0, -1, dtype=jnp.int32)])

@@ -168,7 +168,9 @@ def layered_step(
         # one factor for a layer, that of its farthest constraint: weights keep their say
         length = safe_sqrt(times(block, r * r))
         length = jnp.max(length[None] * beside.astype(r.dtype).reshape(*beside.shape, *[1] * (r.ndim - 1)), axis=1)
-        r = r * jnp.minimum(1, safe_divide(jnp.broadcast_to(most, length.shape), length))
+        # 1, not 0, where the length is 0: the derivative is that of what is not clamped
+        far = length > most
+        r = r * jnp.where(far, most / jnp.where(far, length, jnp.ones_like(length)), jnp.ones_like(length))
         y = times(factors.pull, r) + rest
         # what the layers above have spent, and what this one asks for
         square = y * y
