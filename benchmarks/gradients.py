@@ -56,7 +56,7 @@ def speed(frames: int) -> None:
         bend = problem(frames, gradient, 20)
         forward, both = functions(bend)
         left = bend(bend.variables).converged
-        run = [lambda f=f: jax.block_until_ready(f(bend.variables)) for f in (forward, both)]
+        run = [lambda f=f, v=bend.variables: jax.block_until_ready(f(v)) for f in (forward, both)]
         for f in run:
             f()
         one, two = (best(f, 7) for f in run)

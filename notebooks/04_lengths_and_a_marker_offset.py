@@ -60,7 +60,9 @@ print(f"feet off their places by {1e3 * np.nanmax(bent.report.residual[:, [0, 2]
 # %%
 true_offset = np.array([0.025, -0.04, 0.06])  # metres, from the marker to the hip joint, in the axes of the hips
 true_scale = np.array([1.05, 0.96])  # of the captured skeleton's thighs and shanks
-legs = [[names.index(side + n) for side in ("Left", "Right")] for n in ("Leg", "Foot")]  # a bone belongs to its lower joint
+legs = [
+    [names.index(side + n) for side in ("Left", "Right")] for n in ("Leg", "Foot")
+]  # a bone belongs to its lower joint
 rng = np.random.default_rng(0)
 wrong = np.array(true.skeleton.offsets)
 for bones, scale in zip(legs, true_scale, strict=True):
@@ -73,6 +75,7 @@ captured = replace(true, skeleton=replace(true.skeleton, offsets=wrong), transla
 # %% [markdown]
 # Detection on what was captured finds the stances in spite of their slide, `still` a little wider than usual. What is to vanish: how far a
 # foot is from its mean place in its stance.
+
 
 # %%
 def corrected(unknown):
@@ -145,3 +148,7 @@ for x, label, color in ((start, "captured", "tab:red"), (unknown, "corrected", "
 axes[1].set(xlabel="time [s]", ylabel="left foot, from its stance's mean [mm]")
 axes[1].legend()
 figure.suptitle("Feet that stand stay where they are")
+
+# %%
+assert np.linalg.norm(offset - true_offset) < 1e-3
+assert before > 10 * after

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import jax
 import jupytext
 import pytest
 
@@ -15,5 +16,9 @@ def test_notebook_runs(path, monkeypatch, tmp_path):
     cells = [c.source for c in notebook.cells if c.cell_type == "code"]
     assert len(cells) > 5 and any(c.cell_type == "markdown" for c in notebook.cells)
     names = {"__name__": "__main__"}
-    for i, source in enumerate(cells):
-        exec(compile(source, f"{path.name} cell {i}", "exec"), names)
+    before = jax.config.jax_enable_x64
+    try:
+        for i, source in enumerate(cells):
+            exec(compile(source, f"{path.name} cell {i}", "exec"), names)
+    finally:
+        jax.config.update("jax_enable_x64", before)  # a notebook sets it for good

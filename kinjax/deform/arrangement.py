@@ -52,8 +52,11 @@ class Arrangement:
     """The constant part: arrays of a plan, and where variables go in it.
 
     owner: (F, B) the constraint that each task serves, -1 for none. first: (C,) weights that the plan was made with. world:
-    (C,) 1 where a place counts from the world's origin. kept, parents, moving, moving_root, roots, holder, carrier: joints of the
-    skeleton (see `frames_of`). centers: (J, 3) of the body parts. supports: (D, M) the part of the mass points' weights that no mass makes.
+    (C,) 1 where a place counts from the world's origin, which the solver counts from `origin`. centers: (J, 3) of the body parts.
+    supports: (D, M) the part of the mass points' weights that no mass makes. at_mass: (J,) the mass point that a joint's mass is in,
+    -1 for none. place_in: (J,) where a joint is in the chain, -1 for the others. parents: (J,). path_of: (J,) a joint's row of
+    translations, -1 for none. kept: the chain's joints. moving: of those that move in their parents, (place in the chain, row of
+    translations). root_path: the root's row, -1 where it does not move.
     """
 
     chain: Any
@@ -66,7 +69,7 @@ class Arrangement:
     centers: Float[Array, "j 3"]
     supports: Float[Array, "d m"]
     at_mass: Int[Array, " j"]
-    kept_or_none: Int[Array, " j"]
+    place_in: Int[Array, " j"]
     parents: Int[Array, " j"]
     path_of: Int[Array, " j"]
     kept: tuple[int, ...] = field(metadata={"static": True})
@@ -119,13 +122,15 @@ def arranged(motion: Motion, goals: tuple[Goal, ...], plan: Plan) -> tuple[Arran
         np.array([new.get(j, -1) for j in range(len(top.names))], np.int32),
         np.array(top.parents, np.int32),
         np.array([paths.get(j, -1) for j in range(len(top.names))], np.int32),
+        tuple(kept),
+        tuple((new[j], k) for j, k in paths.items() if j in new and top.parents[j] >= 0),
+        root_path,
     )
-    moving = tuple((new[j], k) for j, k in paths.items() if j in new and top.parents[j] >= 0)
     variables: Any = (
         place, rotation, np.array([float(g.weight) for g in goals]), np.asarray(motion.skeleton.offsets, float),
         np.asarray(motion.rotations, float), np.asarray(motion.translations, float), masses,
     )  # fmt: skip
-    return Arrangement(*constant, tuple(kept), moving, root_path), Variables(*variables)
+    return Arrangement(*constant), Variables(*variables)
 
 
 def _mass_rows(plan: Plan, masses: np.ndarray, top: Any) -> np.ndarray:
@@ -147,7 +152,9 @@ def frames_of(a: Arrangement, v: Variables) -> tuple[Tasks, Frames]:
     n = len(a.kept)
     kept = np.array(a.kept, np.int32)
     turns = jnp.moveaxis(v.rotations[:, kept], 2, 0)
-    turns = jnp.where(jnp.isfinite(turns).all(0), normalize(turns), turns)  # a derivative along a quaternion means nothing
+    turns = jnp.where(
+        jnp.isfinite(turns).all(0), normalize(turns), turns
+    )  # a derivative along a quaternion means nothing
     rotations = jnp.asarray(frames.rotations).at[:, :, :n].set(jnp.moveaxis(turns, 0, 1))
     offsets = jnp.asarray(frames.offsets).at[:, :n].set(v.offsets[kept])
     for row, k in a.moving:
@@ -181,7 +188,7 @@ def _masses(a: Arrangement, v: Variables) -> tuple[Tasks, Float[Array, "f m 3"]]
     xs = (
         jnp.arange(joints, dtype=jnp.int32),
         jnp.where(a.parents < 0, jnp.asarray(joints, jnp.int32), a.parents),
-        a.kept_or_none >= 0,
+        a.place_in >= 0,
         a.path_of,
         local,
         v.offsets,

@@ -110,7 +110,9 @@ class Bend:
                 raise ShapeError(f"{name} has shape {jnp.shape(given)}, the motion and constraints need {own.shape}")
         length = self._arrays.owner.shape[0]
         v = jax.tree.map(lambda x: jnp.asarray(x, self.variables.weight.dtype), variables)
-        v = replace(v, **{n: _longer(getattr(v, n), length) for n in ("place", "rotation", "rotations", "translations")})
+        v = replace(
+            v, **{n: _longer(getattr(v, n), length) for n in ("place", "rotation", "rotations", "translations")}
+        )
         rotations, translations, left, sound = _bend(
             self._arrays,
             v,
@@ -147,19 +149,27 @@ def _padded(a: Arrangement, frames: int) -> Arrangement:
     grown.controlled[frames:] = 0
     grown.root_controlled[frames:] = 0
     owner = np.concatenate([a.owner, np.full((more, a.owner.shape[1]), -1, np.int32)])
-    return replace(a, frames=grown, owner=owner)
+    longer: Any = owner
+    return replace(a, frames=grown, owner=longer)
 
 
 @partial(jax.jit, static_argnames=("static", "gradient", "attract", "settle"))
 def _bend(
-    a: Arrangement, v: Variables, solving: Solving, static: Static, gradient: str, attract: tuple[bool, bool], settle: int
+    a: Arrangement,
+    v: Variables,
+    solving: Solving,
+    static: Static,
+    gradient: str,
+    attract: tuple[bool, bool],
+    settle: int,
 ) -> tuple[Array, Array, Array, Array]:
     """Rotations (F, J, 4), translations (F, T, 3), distances and soundness (F,)."""
     tasks, frames = frames_of(a, v)
     still = jnp.eye(4, 1, dtype=frames.root.dtype)
     q, t = frames.rotations[0], frames.root[0]
     pose = Pose(
-        jnp.where(jnp.isfinite(q).all(0), q, still)[..., None], jnp.where(jnp.isfinite(t), t, jnp.zeros_like(t))[:, None]
+        jnp.where(jnp.isfinite(q).all(0), q, still)[..., None],
+        jnp.where(jnp.isfinite(t), t, jnp.zeros_like(t))[:, None],
     )
     first = Carried(pose, pose, jnp.ones(static.layers, t.dtype), jnp.ones((), t.dtype))
     asked = Asked(a.chain, tasks, frames, first)
@@ -184,4 +194,3 @@ def _bend(
     if a.root_path >= 0:
         translations = translations.at[:, a.root_path].set(found.root + a.origin)
     return rotations, translations, left, solved.sound
-

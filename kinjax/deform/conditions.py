@@ -259,7 +259,10 @@ def _attraction_change(chain: Chain, z: Float[Array, " n"]) -> Float[Array, "n n
     square = v[:, :, None] * v[:, None, :] - angle2[:, None, None] * eye
     own = -(eye - hat / 2 + c[:, None, None] * square)
     strict = chain.above - jnp.eye(joints, dtype=z.dtype)
-    turned = strict[:, None, :, None] * hat[:, :, None, :] + jnp.eye(joints, dtype=z.dtype)[:, None, :, None] * own[:, :, None]
+    turned = (
+        strict[:, None, :, None] * hat[:, :, None, :]
+        + jnp.eye(joints, dtype=z.dtype)[:, None, :, None] * own[:, :, None]
+    )
     n = 3 * joints
     out = jnp.zeros((3 + n, 3 + n), z.dtype).at[:3, :3].set(-eye)
     return out.at[3:, 3:].set(turned.reshape(n, n))
@@ -275,7 +278,8 @@ def nearby(chain: Chain, world: World, step: Float[Array, " n"]) -> World:
     slid = jnp.sum(chain.above[:, :, None] * _cross(turn, place)[None], axis=1)
     shift = _cross(turned, place) - slid + step[:3]
     change = jnp.concatenate(
-        [_cross(turned[:, None], jnp.swapaxes(world[:joints, :, :3, 0], 1, 2)).swapaxes(1, 2), shift[:, :, None]], axis=2
+        [_cross(turned[:, None], jnp.swapaxes(world[:joints, :, :3, 0], 1, 2)).swapaxes(1, 2), shift[:, :, None]],
+        axis=2,
     )
     return world.at[:joints, :, :, 0].add(change)
 
@@ -305,7 +309,9 @@ def _lowest(tasks: Tasks, frame: Frames) -> Int[Array, ""]:
     return jnp.max(jnp.where(frame.goals.active > 0, tasks.layer, -1))
 
 
-def _faint(normal: Float[Array, "m m"], sigma2: Float[Array, " m"], strength: Float[Array, " m"]) -> Float[Array, "m m"]:
+def _faint(
+    normal: Float[Array, "m m"], sigma2: Float[Array, " m"], strength: Float[Array, " m"]
+) -> Float[Array, "m m"]:
     """`strength^2 / (1 + (s / sigma)^2)^8` along each singular direction of the layers' own rows, `normal` being R_ii' R_ii."""
     fade = inverse(jnp.eye(len(sigma2), dtype=normal.dtype) + normal / safe_sqrt(sigma2[:, None] * sigma2[None, :]))
     fade = times(fade, fade)

@@ -25,8 +25,8 @@ from jaxtyping import Array, Bool, Float, Int
 from ..numerics import safe_divide, safe_sqrt
 from ..rotations import log
 from .chain import Chain, Pose, World, compose, forward, inverse_of, moved, parent_rotations
-from .prioritized import factorize, layered_step, outside, times
 from .loops import Loop, plain
+from .prioritized import factorize, layered_step, outside, times
 from .tasks import CENTER_OF_MASS, Goals, Kinds, Tasks, jacobian, look, residuals
 
 PULLS = (1.0, 0.25)

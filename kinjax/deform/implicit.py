@@ -24,7 +24,6 @@ from .conditions import Factors, Numbers, Solved, balance, derivative, factors_o
 from .sequence import Carried, Frames
 from .tasks import Kinds, Tasks
 
-
 TOGETHER = 16
 """Frames that are differentiated at once."""
 
@@ -130,9 +129,7 @@ def settled(
         def missing(pose: Pose) -> tuple[Factors, Array]:
             there = at._replace(pose=pose)
             factors = factors_of(clean.chain, clean.tasks, x, there, numbers, static.layers, static.kinds)
-            return factors, balance(
-                clean.chain, clean.tasks, x, there, factors, numbers, static.layers, static.kinds
-            )
+            return factors, balance(clean.chain, clean.tasks, x, there, factors, numbers, static.layers, static.kinds)
 
         def step(_: Any, state: tuple[Pose, Factors, Array]) -> tuple[Pose, Factors, Array]:
             pose, factors, left = state
