@@ -204,6 +204,25 @@ def pivot_energy(e: Quadratic, ridge: Float[Array, ""]) -> tuple[Float[Array, ".
     return jnp.maximum(e.c + dot(e.b, p), 0), p
 
 
+@jax.custom_jvp
+def _eigen(m: Float[Array, "n 3 3"]) -> tuple[Float[Array, "n 3"], Float[Array, "n 3 3"]]:
+    """Eigenvalues, ascending, and eigenvectors (columns); where two values coincide, as at rest, their vectors count as constant."""
+    values, vectors = jnp.linalg.eigh(m)
+    return values, vectors
+
+
+@_eigen.defjvp
+def _eigen_change(primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    values, vectors = _eigen(*primals)
+    symmetric = (tangents[0] + jnp.swapaxes(tangents[0], 1, 2)) / 2
+    inner = jnp.matmul(jnp.matmul(jnp.swapaxes(vectors, 1, 2), symmetric, precision="highest"), vectors, precision="highest")
+    gap = values[:, None, :] - values[:, :, None]
+    apart = jnp.abs(gap) > 32 * jnp.finfo(values.dtype).eps
+    mixed = jnp.where(apart, inner / jnp.where(apart, gap, 1), 0)
+    change = jnp.diagonal(inner, axis1=1, axis2=2), jnp.matmul(vectors, mixed, precision="highest")
+    return (values, vectors), change
+
+
 class Fit(NamedTuple):
     """Refitted constraint: `eigenvalues` of `M` ascending (3, ...), world `point` (from the origin of the moments), unit
     world `axis`, root mean square `residual` of the pivot and `spread` of the object's origin about its mean `center`."""
@@ -225,7 +244,7 @@ def fit(x: Moments, line_below: Float[Array, "..."], noise: Float[Array, "..."],
     """
     e = quadratic(x)
     batch = jnp.moveaxis(e.m.reshape(3, 3, -1), -1, 0)
-    values, vectors = jnp.linalg.eigh(batch)
+    values, vectors = _eigen(batch)
     shape = x.n.shape
     values = jnp.moveaxis(values, -1, 0).reshape(3, *shape)
     vectors = jnp.moveaxis(vectors, 0, -1).reshape(3, 3, *shape)  # columns: eigenvectors
