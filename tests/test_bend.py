@@ -72,7 +72,9 @@ def slope(loss, bend: Bend, name: str, direction: np.ndarray, h: float) -> float
     return (at(h) - at(-h)) / (2 * h)
 
 
-@pytest.mark.parametrize("goals", [IN_THE_WORLD, ON_THE_BODY], ids=["world", "body"])
+@pytest.mark.parametrize(
+    "goals", [IN_THE_WORLD, pytest.param(ON_THE_BODY, marks=pytest.mark.slow)], ids=["world", "body"]
+)
 def test_gradients_are_central_differences(x64, goals):
     bend = Bend(MOTION, goals, EXACT, settle=5)
     bent = bend(bend.variables)

@@ -76,7 +76,7 @@ def check_along(f, x, step, rel):
     np.testing.assert_allclose(slope, middle, rtol=rel)
 
 
-@pytest.mark.parametrize("method", ["robust", "paper"])
+@pytest.mark.parametrize("method", [pytest.param("robust", marks=pytest.mark.slow), "paper"])
 def test_gradients_through_the_whole_against_finite_differences(x64, method):
     scene = synthetic.with_noise(synthetic.walking_biped(), 0.002, seed=2)
     motion, t = scene.motion.slice(0, 159), jnp.asarray(0.2)
@@ -97,7 +97,7 @@ def test_gradients_through_the_whole_against_finite_differences(x64, method):
         check_along(lambda y, i=i: loss(*at[:i], y, *at[i + 1 :]), at[i], 1e-8 if i < 3 else 1e-6, 2e-5)
 
 
-@pytest.mark.parametrize("method", ["robust", "paper"])
+@pytest.mark.parametrize("method", ["robust", pytest.param("paper", marks=pytest.mark.slow)])
 def test_gradients_of_given_thresholds_and_poses(x64, method):
     poses = walk(160)
     task = soft.prepare(poses, method=method)
@@ -112,6 +112,7 @@ def test_gradients_of_given_thresholds_and_poses(x64, method):
     check_along(lambda y: loss(limits, y, x), q, 1e-8, 2e-5)
 
 
+@pytest.mark.slow
 def test_float32_gradient_is_that_of_float64():
     def slope():
         poses = walk(160)
@@ -177,6 +178,7 @@ def test_a_bad_clip_leaves_the_others_of_a_batch_as_they_are():
     assert float(good[0][2]) == pytest.approx(float(alone), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_scan_over_temperatures_and_padding():
     poses = walk(100)
     task = soft.prepare(poses)

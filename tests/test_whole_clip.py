@@ -271,6 +271,7 @@ def test_gradient_is_zero_at_the_result(arm, bent_arm):
 
 
 # ------------------------------------------------------------------------------------------------------------------ the clip
+@pytest.mark.slow
 def test_without_smoothness_it_is_frame_by_frame(motion):
     """The same weights through the solver that knows one frame at a time."""
     short = motion.slice(0, 11)
@@ -303,6 +304,7 @@ def test_what_no_constraint_recruits_stays(motion, reached):
     assert np.abs(kept.motion.rotations - motion.rotations).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_acceleration_falls_as_its_weight_grows(motion):
     """And the constraint gives way little by little: the bounds are metres, by weight."""
     worst, off = [], []
@@ -314,7 +316,7 @@ def test_acceleration_falls_as_its_weight_grows(motion):
     assert (np.array(off) < [1e-4, 2e-3, 8e-3, 0.05]).all() and off[-1] > off[0]
 
 
-@pytest.mark.parametrize("ratio", [3.0, 10.0])
+@pytest.mark.parametrize("ratio", [pytest.param(3.0, marks=pytest.mark.slow), 10.0])
 def test_a_higher_layer_holds_better(motion, ratio):
     """Two goals for one hand: the mean of both, weighted by the squares, as far as the weak terms let it."""
     a, b = np.array([0.3, 0.3, 1.2]), np.array([0.3, 0.3, 1.3])
@@ -362,6 +364,7 @@ def test_too_few_steps_are_said(motion):
     assert "not a minimum" in d.report.notes[-1]
 
 
+@pytest.mark.slow
 def test_out_of_reach_stalls(motion):
     """The minimum is found all the same; the layers above give way by their weight."""
     far = Position("LeftHand", at=(2.5, 0.5, 1.2), begin=15, end=20, ease_in=0.2, ease_out=0.2, priority=1)
@@ -371,6 +374,7 @@ def test_out_of_reach_stalls(motion):
     assert d.report.status[17, 2] == STATUSES.index("stalled")
 
 
+@pytest.mark.slow
 def test_it_starts_where_it_is_told(motion, reached):
     """From its own result nothing is left to do; the result of `deform` leads to a minimum no worse than the input does."""
     again = whole_clip(motion, REACH, start=reached.motion)
@@ -380,6 +384,7 @@ def test_it_starts_where_it_is_told(motion, reached):
     assert other.again.converged and other.again.cost < 1.01 * reached.again.cost
 
 
+@pytest.mark.slow
 def test_float32_is_near_float64(motion, reached):
     d = whole_clip(motion, REACH, Settings(precision="float32"))
     assert d.again.cost < 1.3 * reached.again.cost
@@ -430,6 +435,7 @@ def sizes(jaxpr) -> list[int]:
     return out
 
 
+@pytest.mark.slow
 def test_memory_grows_with_the_frames(x64):
     """The largest array of a program of twice the frames is twice as large, and far from the square of the unknowns."""
     largest, unknowns = [], []

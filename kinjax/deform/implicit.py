@@ -234,12 +234,12 @@ def _finite(asked: Asked, change: Asked, good: Bool[Array, " f"]) -> tuple[Asked
             return jnp.isfinite(x).all(tuple(range(1, x.ndim)))
 
         tangent = frames is not safe
-        still = 0.0 if tangent else jnp.eye(4, 1, dtype=x64_of(safe))[None]
+        still = 0.0 if tangent else jnp.eye(4, 1, dtype=safe.root.dtype)[None]
         own = finite(safe.rotations) & finite(safe.root)
         goals, sane = frames.goals, safe.goals
         place = jnp.isfinite(sane.place).all(-1, keepdims=True)
         turn = jnp.isfinite(sane.rotation).all(-1, keepdims=True)
-        unit = 0.0 if tangent else jnp.eye(1, 4, dtype=x64_of(safe))[None]
+        unit = 0.0 if tangent else jnp.eye(1, 4, dtype=safe.root.dtype)[None]
         goals = goals._replace(
             place=jnp.where(place & good[:, None, None], goals.place, 0),
             rotation=jnp.where(turn & good[:, None, None], goals.rotation, unit),
@@ -259,11 +259,6 @@ def _finite(asked: Asked, change: Asked, good: Bool[Array, " f"]) -> tuple[Asked
         asked._replace(frames=clean(asked.frames, asked.frames)),
         change._replace(frames=clean(change.frames, asked.frames)) if change is not asked else asked,
     )
-
-
-def x64_of(frames: Frames) -> Any:
-    """The precision of a clip."""
-    return frames.root.dtype
 
 
 def _chain(
