@@ -35,10 +35,12 @@ def test_sigma_epsilon_to_second_order_both_ways(x64):
     along = jnp.asarray(RNG.normal(size=q.shape)), jnp.asarray(RNG.normal(size=t.shape))
     h = 1e-5
     exact = jax.jvp(signals, (q, t), along)[1]
-    apart = [
-        jax.tree.map(lambda a, b, k=k: (a - b) / (2 * k * h), *(signals(q + s * k * h * along[0], t + s * k * h * along[1]) for s in (1, -1)))
-        for k in (1, 2)
-    ]
+
+    def central(k):
+        beside = (signals(q + s * h * along[0], t + s * h * along[1]) for s in (k, -k))
+        return jax.tree.map(lambda a, b: (a - b) / (2 * k * h), *beside)
+
+    apart = [central(k) for k in (1, 2)]
     for e, one, two in zip(exact, *apart, strict=True):  # Richardson: fourth order
         np.testing.assert_allclose(e, (4 * one - two) / 3, rtol=1e-9, atol=1e-9)
 
@@ -84,7 +86,8 @@ def test_refit_is_differentiable(x64, line):
     exact, h = jax.jvp(f, (turns, places), along)[1], 1e-3
 
     def central(k):
-        return (f(turns + k * h * along[0], places + k * h * along[1]) - f(turns - k * h * along[0], places - k * h * along[1])) / (2 * k * h)
+        after, before = (f(turns + s * h * along[0], places + s * h * along[1]) for s in (k, -k))
+        return (after - before) / (2 * k * h)
 
     np.testing.assert_allclose(exact, (15 * central(1) - 6 * central(2) + central(3)) / 10, rtol=1e-9, atol=1e-9)
     back = jax.grad(lambda a, b: jnp.sum(f(a, b)), (0, 1))(turns, places)
