@@ -1,61 +1,23 @@
 """Where the body is: forward kinematics, and the world poses of joints and of marker clusters.
 
-In: a `Motion` (joint rotations) or markers. Out: world rotations and positions, or `Poses`. The joints are walked by one
-`lax.scan` whose parents are data: it compiles once for each number of joints, whatever the skeleton.
+In: a `Motion` (joint rotations) or markers. Out: world rotations and positions, or `Poses`. The kernel is `forward`'s.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from . import quaternions
 from .errors import OptionError, ShapeError, find_name
+from .forward import world_transforms
 from .lengths import bucket
 from .motion import Motion, Poses
-from .rotations import multiply, rotate
-
-
-def world_transforms(
-    rotations: Float[Array, "joints 4 frames"],
-    moving: Float[Array, "t 3 frames"],
-    offsets: Float[Array, "joints 3"],
-    parents: Int[Array, " joints"],
-    translated: Int[Array, " t"],
-) -> tuple[Float[Array, "rows frames"], ...]:
-    """The seven components of every joint's world quaternion and position: the kernel under everything here.
-
-    rotations: local. offsets: metres in the parent's frame; the `translated` joints have `moving` ones instead. A root's
-    parent is -1. The row after the last joint's is the identity, the parent of the roots.
-    """
-    joints, _, frames = rotations.shape
-    own = jnp.full(joints, -1, jnp.int32).at[translated].set(jnp.arange(translated.shape[0], dtype=jnp.int32))
-    one, zero = jnp.ones(frames, rotations.dtype), jnp.zeros(frames, rotations.dtype)
-    identity = (one, *(zero,) * 6)
-
-    # one array a component, each of which a step writes in one vectorised pass (a concatenation would not be one). A step
-    # fetches its successor's parent after it has written: were its own fetched first, XLA would copy the arrays every step
-    def step(carried: Any, x: tuple[Array, ...]) -> tuple[Any, None]:
-        world, above = carried
-        j, following, q, offset, path = x
-        moved = jax.lax.dynamic_index_in_dim(moving, jnp.maximum(path, 0), 0, keepdims=False)
-        t = [jnp.where(path >= 0, m, o) for m, o in zip(moved, offset, strict=True)]
-        here = (*multiply(above[:4], q), *(a + b for a, b in zip(above[4:], rotate(above[:4], t), strict=True)))
-        world = tuple(jax.lax.dynamic_update_index_in_dim(w, h, j, 0) for w, h in zip(world, here, strict=True))
-        above = tuple(jax.lax.dynamic_index_in_dim(w, following, 0, keepdims=False) for w in world)
-        return (world, above), None
-
-    rows = jnp.where(parents < 0, joints, parents)
-    above = identity  # the first joint is a root
-    xs = jnp.arange(joints, dtype=jnp.int32), jnp.roll(rows, -1), rotations, offsets, own
-    world = tuple(jnp.broadcast_to(x, (joints + 1, frames)) for x in identity)
-    return jax.lax.scan(step, (world, above), xs)[0][0]
 
 
 @jax.jit
@@ -69,7 +31,8 @@ def forward_kinematics(motion: Motion) -> tuple[Float[Array, "frames joints 4"],
     """World rotation (wxyz) and position (metres) of every joint at every frame.
 
     Shapes (frames, joints, 4) and (frames, joints, 3) of a motion without batch axes. Compiles once for each length: pad
-    with `lengths.bucket` where lengths vary.
+    with `lengths.bucket` where lengths vary. Differentiable to any order, along unit quaternions: the gradient by a
+    rotation has no part along the quaternion itself.
     """
     if motion.rotations.ndim != 3:
         raise ShapeError(f"rotations {motion.rotations.shape}: one clip is (frames, joints, 4); vmap for more")

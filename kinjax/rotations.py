@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from . import components
 from .numerics import safe_sqrt
 
 Quaternion = Float[Array, "4 ..."]
@@ -22,29 +23,17 @@ Parts = Sequence[Float[Array, "..."]]
 
 def multiply(a: Quaternion | Parts, b: Quaternion | Parts) -> Quaternion:
     """Hamilton product: first `b`, then `a`."""
-    aw, ax, ay, az = a
-    bw, bx, by, bz = b
-    return jnp.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ]
-    )
+    return jnp.stack(components.multiply(a, b))
 
 
 def conjugate(q: Quaternion) -> Quaternion:
     """Inverse rotation."""
-    w, x, y, z = q
-    return jnp.stack([w, -x, -y, -z])
+    return jnp.stack(components.conjugate(q))
 
 
 def cross(a: Vector | Parts, b: Vector | Parts) -> Vector:
     """Cross product."""
-    ax, ay, az = a
-    bx, by, bz = b
-    return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+    return jnp.stack(components.cross(a, b))
 
 
 def dot(a: Float[Array, "c ..."] | Parts, b: Float[Array, "c ..."] | Parts) -> Float[Array, "..."]:
@@ -64,9 +53,7 @@ def apply_transposed(r: Float[Array, "3 3 ..."], v: Vector) -> Vector:
 
 def rotate(q: Quaternion | Parts, v: Vector | Parts) -> Vector:
     """`R(q) v`."""
-    w, *u = q
-    t = [x + x for x in cross(u, v)]
-    return jnp.stack([x + w * y + z for x, y, z in zip(v, t, cross(u, t), strict=True)])
+    return jnp.stack(components.rotate(q, v))
 
 
 def normalize(q: Quaternion) -> Quaternion:
@@ -81,25 +68,19 @@ def normalize(q: Quaternion) -> Quaternion:
 
 def matrix(q: Quaternion) -> Float[Array, "3 3 ..."]:
     """Rotation matrix, rows first."""
-    w, x, y, z = q
-    return jnp.stack(
-        [
-            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
-            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
-            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
-        ]
-    )
+    r = components.matrix(q)
+    return jnp.stack([jnp.stack(r[i : i + 3]) for i in (0, 3, 6)])
 
 
 def exp(v: Vector) -> Quaternion:
-    """Quaternion of a rotation vector (radians, full angle)."""
-    angle = safe_sqrt(dot(v, v))  # where the square underflows the series does not need it
-    half = angle / 2
-    small = angle < 1e-3
-    safe = jnp.where(small, jnp.ones_like(angle), angle)
-    # sin(x/2)/x by its series where the quotient would lose the gradient
-    factor = jnp.where(small, 0.5 - dot(v, v) / 48, jnp.sin(safe / 2) / safe)
-    return jnp.concatenate([jnp.cos(half)[None], factor * v])
+    """Quaternion of a rotation vector (radians, full angle), smooth at 0 to any order that is asked for."""
+    square = dot(v, v)
+    # by their series where the quotients would lose digits, and the square root its derivatives
+    small = square < 1e-3
+    half = jnp.sqrt(jnp.where(small, jnp.ones_like(square), square)) / 2
+    w = jnp.where(small, 1 - square / 8 + square * square / 384, jnp.cos(half))
+    factor = jnp.where(small, 0.5 - square / 48 + square * square / 3840, jnp.sin(half) / (half + half))
+    return jnp.concatenate([w[None], factor * v])
 
 
 def log(q: Quaternion) -> Vector:

@@ -112,7 +112,7 @@ def slides(unknown, stance):
 def worst(unknown, stance):
     """Root mean square slide, metres."""
     d = slides(unknown, stance)
-    return float(jnp.sqrt(jnp.sum(d**2) / (stance >= 0).sum()))
+    return float(jnp.sqrt(jnp.sum(d**2) / int((stance >= 0).sum())))
 
 
 # %% [markdown]

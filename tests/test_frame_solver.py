@@ -17,10 +17,11 @@ from kinjax.deform.tasks import jacobian, look, residuals
 from kinjax.motion import Motion
 
 
-def test_lower_layers_cost_higher_ones_nothing(x64):
-    """`err_i(all) <= err_i(without the lower ones) + max(1e-6 m, 1e-3 err_i)` on 1,000 problems of two to five layers, a third
+@pytest.mark.parametrize("count", [100, pytest.param(1000, marks=pytest.mark.slow)])
+def test_lower_layers_cost_higher_ones_nothing(x64, count):
+    """`err_i(all) <= err_i(without the lower ones) + max(1e-6 m, 1e-3 err_i)` on problems of two to five layers, a third
     of whose targets are out of reach."""
-    p = problems(1000, np.random.default_rng(11))
+    p = problems(count, np.random.default_rng(11))
     one = Problems(*(jnp.asarray(x) for x in p))
     run = jax.jit(jax.vmap(partial(solve, solving=Solving(iterations=12)), in_axes=(0, None)))
     errors = [np.asarray(run(one, depth).errors) for depth in range(1, 6)]
@@ -32,7 +33,7 @@ def test_lower_layers_cost_higher_ones_nothing(x64):
         bound = errors[i][:, i] + np.maximum(1e-6, 1e-3 * whole[:, i])
         assert (whole[below, i] <= bound[below]).all(), (i, np.flatnonzero(below & (whole[:, i] > bound))[:5])
         unreached += int((whole[below, i] > 1e-3).sum())
-    assert unreached > 100  # the bound was put to the test
+    assert unreached > count / 10  # the bound was put to the test
 
 
 def example(kind: str):

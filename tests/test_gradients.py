@@ -10,8 +10,8 @@ from jax.test_util import check_grads
 from kinjax.detect.displacements import displacements, mean_pose
 from kinjax.detect.refit import Moments, fit
 from kinjax.detect.sigma_epsilon import project
-from kinjax.kinematics import world_transforms
-from kinjax.rotations import apply_transposed, dot, exp, log, matrix, normalize
+from kinjax.forward import world_transforms
+from kinjax.rotations import apply_transposed, dot, exp, log, matrix, multiply, normalize
 from kinjax.splines import monotone_cubic, natural_cubic
 
 RNG = np.random.default_rng(5)
@@ -112,8 +112,32 @@ def test_kinematics_to_second_order_under_jit_and_vmap(x64):
         return jnp.stack(world_transforms(unit, moving, offsets, parents, jnp.zeros(1, jnp.int32)))
 
     check_grads(jax.jit(where), (q, moving, offsets), order=2, modes=("fwd", "rev"), atol=1e-5, rtol=1e-5)
+    longer = jax.jvp(lambda q: world_transforms(q, moving, offsets, parents, jnp.zeros(1, jnp.int32)), (q,), (q,))[1]
+    np.testing.assert_allclose(jnp.stack(longer), 0, atol=1e-12)  # what changes a quaternion's length alone
     many = jax.vmap(jax.grad(lambda x: jnp.sum(where(x, moving, offsets) ** 2)))(jnp.stack([q, 2 * q]))
     np.testing.assert_allclose(many[0], 2 * many[1], atol=1e-12)
+
+
+def test_gimbal_positions_are_like_any_other(x64):
+    """Two axes of an Euler triple fall together there; quaternions do not know."""
+    from scipy.spatial.transform import Rotation
+
+    parents, none = jnp.array([-1, 0, 1], jnp.int32), jnp.zeros(0, jnp.int32)
+    angles = RNG.uniform(-180, 180, size=(3, 6, 3))
+    angles[:, :, 1] = np.where(np.arange(6) % 2, 90.0, -90.0)
+    q = Rotation.from_euler("ZXY", angles.reshape(-1, 3), degrees=True).as_quat(scalar_first=True)
+    q = jnp.asarray(np.moveaxis(q.reshape(3, 6, 4), 1, 2))
+    moving, offsets = jnp.zeros((0, 3, 6)), jnp.asarray(RNG.normal(size=(3, 3)))
+    along, h = jnp.asarray(RNG.normal(size=(3, 3, 6))), 1e-5
+
+    @jax.jit
+    def where(v):
+        turned = jnp.swapaxes(multiply(jnp.swapaxes(q, 0, 1), exp(jnp.swapaxes(v, 0, 1))), 0, 1)
+        return jnp.stack(world_transforms(turned, moving, offsets, parents, none))
+
+    slope = jax.jvp(where, (0 * along,), (along,))[1]
+    np.testing.assert_allclose(slope, (where(h * along) - where(-h * along)) / (2 * h), atol=1e-8)
+    assert np.isfinite(jax.grad(lambda v: jnp.sum(where(v) ** 3))(0 * along)).all()
 
 
 def test_rotation_vectors_are_smooth_through_zero(x64):

@@ -1,6 +1,7 @@
 """Pictures: each is drawn without a warning, and what is drawn are the numbers of the detection."""
 
 import io
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -119,13 +120,13 @@ def plots():
 def test_no_global_state(plots):
     import matplotlib
 
-    before = dict(matplotlib.rcParams)
-    drawn(plots.timeline(fake_detection()))
-    assert dict(matplotlib.rcParams) == before
-    import sys
+    def figures():
+        """Those that pyplot holds, if it was ever asked for."""
+        return sys.modules["matplotlib.pyplot"].get_fignums() if "matplotlib.pyplot" in sys.modules else []
 
-    if "matplotlib.pyplot" in sys.modules:
-        assert sys.modules["matplotlib.pyplot"].get_fignums() == []
+    before = dict(matplotlib.rcParams), figures()
+    drawn(plots.timeline(fake_detection()))
+    assert (dict(matplotlib.rcParams), figures()) == before
 
 
 def test_sigma_epsilon_draws_each_displacement_once_in_its_class(plots):

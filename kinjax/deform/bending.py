@@ -29,6 +29,7 @@ from .loops import plain, stored
 from .plan import make_plan
 from .sequence import Carried, solve_sequence
 from .settings import Settings
+from .solving import as_dtype, solver_numbers
 
 Gradient = Literal["implicit", "implicit_local", "unrolled"]
 
@@ -93,13 +94,10 @@ class Bend:
         dtype = np.dtype(jnp.result_type(float))
         arrangement, variables = arranged(motion, goals, plan)
         self.frames = motion.frames
-        self._arrays = _padded(_cast(arrangement, dtype), self.frames)
-        self.variables: Variables = jax.tree.map(jnp.asarray, _cast(variables, dtype))
+        self._arrays = _padded(as_dtype(arrangement, dtype), self.frames)
+        self.variables: Variables = jax.tree.map(jnp.asarray, as_dtype(variables, dtype))
         self._static = Static(plan.layers, plan.kinds, gradient == "implicit")
-        values: Any = [
-            np.asarray(getattr(self.settings, n), np.int32 if n == "iterations" else dtype) for n in Solving._fields
-        ]
-        self._solving = Solving(*values)
+        self._solving = solver_numbers(self.settings, dtype)
 
     def __call__(self, variables: Variables) -> Bent:
         """The motion that `variables` lead to. Their shapes are those of `self.variables`; a clip's frames are padded inside, so
@@ -127,10 +125,6 @@ class Bend:
         motion = replace(self.motion, rotations=rotations[:f], translations=translations[:f], skeleton=skeleton)
         left = left[:f]
         return Bent(motion, left, left < CONVERGED, sound[:f])
-
-
-def _cast(tree: Any, dtype: np.dtype) -> Any:
-    return jax.tree.map(lambda x: x.astype(dtype) if np.issubdtype(x.dtype, np.floating) else x, tree)
 
 
 def _longer(x: Array, length: int) -> Array:

@@ -71,7 +71,7 @@ def times(a: Float[Array, "... i j c"], b: Float[Array, "... j k c"]) -> Float[A
     return jnp.sum(a[..., :, :, None, :] * b[..., None, :, :, :], axis=-3)
 
 
-def act(r: Float[Array, "... i j c"], v: Float[Array, "... j c"]) -> Float[Array, "... i c"]:
+def act(r: Float[Array, "... i j #c"], v: Float[Array, "... j #c"]) -> Float[Array, "... i c"]:
     """Small matrices times vectors, trial by trial."""
     return jnp.sum(r * v[..., None, :, :], axis=-2)
 

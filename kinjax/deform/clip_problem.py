@@ -13,10 +13,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..rotations import exp
 from .banded import Bands, times
 from .chain import Chain, Pose, compose, forward, parent_rotations
 from .sequence import Frames
-from .tasks import Kinds, Tasks, _levers, look, residuals
+from .tasks import Kinds, Tasks, levers, look, residuals
 
 TOGETHER = 32
 """Frames whose second derivatives are worked out at once."""
@@ -69,7 +70,7 @@ class Problem(NamedTuple):
     def pose(self, frame: Frames, u: Float[Array, " n"]) -> Pose:
         """One frame's input, displaced (trials C = 1)."""
         turn = jnp.matmul(self.spread, u[3:].reshape(-1, 3), precision="highest")
-        q = compose(quaternion_of(turn).T, frame.rotations)
+        q = compose(exp(turn.T), frame.rotations)
         return Pose(q[..., None], (frame.root + self.root_free * u[:3])[:, None])
 
     def asked(self, kinds: Kinds, frame: Frames, u: Float[Array, " n"]) -> Float[Array, "b 3"]:
@@ -137,7 +138,7 @@ class Problem(NamedTuple):
         none = jnp.zeros(3, u.dtype)
         (by_way, by_turn), r = jax.jacfwd(twisted, argnums=(0, 1), has_aux=True)(none, none)  # (B, 3 rows, 3) each
         # the reference's own motion is that of the body the other way round: residuals do not see what moves both
-        arm, moves, rootward = _levers(self.chain, self.tasks, seen, world[:-1, :, 3, 0])
+        arm, moves, rootward = levers(self.chain, self.tasks, seen, world[:-1, :, 3, 0])
         turn = jnp.matmul(self.spread, u[3:].reshape(-1, 3), precision="highest")
         axes = jnp.matmul(parent_rotations(self.chain, world), left_jacobian(turn), precision="highest")
         axes = jnp.einsum("pic,pq->qci", axes, self.spread, precision="highest")  # world axes of each unknown's turn
@@ -176,16 +177,6 @@ class Problem(NamedTuple):
 def _cross(v: Float[Array, "*any 3"]) -> Float[Array, "*any 3 3"]:
     """The matrix of `v x`."""
     return jnp.swapaxes(jnp.cross(v[..., None, :], jnp.eye(3, dtype=v.dtype)), -1, -2)
-
-
-def quaternion_of(v: Float[Array, "*any 3"]) -> Float[Array, "*any 4"]:
-    """Quaternions of rotation vectors, with the second derivatives at no turn, too, from where every solve starts."""
-    square = jnp.sum(v * v, axis=-1, keepdims=True)
-    small = square < 1e-3
-    angle = jnp.sqrt(jnp.where(small, 1, square))
-    w = jnp.where(small, 1 - square / 8 + square * square / 384, jnp.cos(angle / 2))
-    factor = jnp.where(small, 0.5 - square / 48 + square * square / 3840, jnp.sin(angle / 2) / angle)
-    return jnp.concatenate([w, factor * v], axis=-1)
 
 
 def left_jacobian(v: Float[Array, "*any 3"]) -> Float[Array, "*any 3 3"]:

@@ -27,7 +27,7 @@ from .reporting import make_report
 from .results import Deformation
 from .sequence import Solved, displaced
 from .settings import Settings
-from .solving import PIECE, _begin, _cast, _piece
+from .solving import PIECE, as_dtype, begin_pose, piece_of
 from .tasks import Kinds, look, residuals
 
 
@@ -81,14 +81,14 @@ def least_squares(
     dtype = np.dtype(settings.precision)
     with jax.enable_x64(settings.precision == "float64"), jax.numpy_dtype_promotion("standard"):
         plan = make_plan(motion, tuple(constraints), settings)
-        chain, tasks, frames = (_cast(t, dtype) for t in (plan.chain._replace(limits=None), plan.tasks, plan.frames))
+        chain, tasks, frames = (as_dtype(t, dtype) for t in (plan.chain._replace(limits=None), plan.tasks, plan.frames))
         weight = np.asarray(float(ratio) ** np.arange(plan.layers - 1, -1, -1), dtype)
-        carried: Any = _begin(frames.rotations[0], frames.root[0], 1)[:2]
+        carried: Any = begin_pose(frames.rotations[0], frames.root[0], 1)[:2]
         out = []
         count = motion.frames
         for begin in range(0, count, PIECE):
             end = min(begin + PIECE, count)
-            piece = _piece(frames, begin, end)
+            piece = piece_of(frames, begin, end)
             carried, got = _run(
                 chain, tasks, piece, carried, weight, np.asarray(pull, dtype), plan.kinds, settings.iterations
             )

@@ -22,9 +22,9 @@ from jaxtyping import Array, Float, Int
 from ..numerics import safe_divide, safe_sqrt
 from .chain import Chain, Pose, World, forward, moved, parent_rotations
 from .frame_solver import Reference, attraction
-from .prioritized import Basis, inverse, row_basis, times
+from .prioritized import Basis, fading, inverse, row_basis, times
 from .sequence import Frames, displaced
-from .tasks import CENTER_OF_MASS, Kinds, Tasks, jacobian, look, residuals, stiffness, wrench
+from .tasks import CENTER_OF_MASS, Kinds, Seen, Tasks, jacobian, look, residuals, stiffness, wrench
 
 FAINT = 0.02
 """Directions in which a layer moves less than this share of its rows' root mean square length are held back: there the
@@ -48,6 +48,16 @@ class Numbers(NamedTuple):
     attracted: tuple[Float[Array, ""], Float[Array, ""]]
 
 
+class System(NamedTuple):
+    """What the conditions of all frames of a clip share; `layers` and `kinds` are not data."""
+
+    chain: Chain
+    tasks: Tasks
+    numbers: Numbers
+    layers: int
+    kinds: Kinds
+
+
 class Factors(NamedTuple):
     """The constants of one frame's conditions.
 
@@ -63,10 +73,9 @@ class Factors(NamedTuple):
     multipliers: Float[Array, "layers1 m"]
 
 
-def factors_of(
-    chain: Chain, tasks: Tasks, frame: Frames, at: Solved, numbers: Numbers, layers: int, kinds: Kinds
-) -> Factors:
+def factors_of(system: System, frame: Frames, at: Solved) -> Factors:
     """The constants at a pose."""
+    chain, tasks, numbers, layers, kinds = system
     world = forward(chain, at.pose, frame.offsets)
     seen = look(tasks, frame.goals, world)
     r = residuals(tasks, frame.goals, seen, kinds).reshape(-1)
@@ -84,8 +93,8 @@ def factors_of(
     size2 = jnp.where(size2 > 0, size2, jnp.ones_like(size2))
     held = (rows == _lowest(tasks, frame)) & (jnp.repeat(tasks.kind, 3) != CENTER_OF_MASS)
     strength = jnp.where(held, numbers.drag * frame.dragged, jnp.zeros_like(size2))
-    dragged = _faint(normal, numbers.singular**2 * size2, strength)
-    hold = dragged + _faint(normal, FAINT**2 * size2, FAINT * safe_sqrt(size2))
+    dragged = fading(normal, numbers.singular**2 * size2, strength)
+    hold = dragged + fading(normal, FAINT**2 * size2, FAINT * safe_sqrt(size2))
     empty = (jnp.sum(basis.rows**2, axis=1) < 0.5).astype(jac.dtype)  # a row that adds no direction
     solve = inverse(normal + hold + jnp.diag(empty * size2))
     goals = r[:, None] * _members(rows, layers, r.dtype)
@@ -94,43 +103,33 @@ def factors_of(
     return Factors(basis, solve, hold, dragged, _multipliers(basis.factors, jnp.where(above, sought, 0), jac).T)
 
 
-def balance(
-    chain: Chain,
-    tasks: Tasks,
-    frame: Frames,
-    at: Solved,
-    factors: Factors,
-    numbers: Numbers,
-    layers: int,
-    kinds: Kinds,
-) -> Float[Array, " n"]:
+def balance(system: System, frame: Frames, at: Solved, factors: Factors) -> Float[Array, " n"]:
     """The conditions: 0 at a pose where nothing can be gained, else about the step that is missing."""
-    world = forward(chain, at.pose, frame.offsets)
-    own = _balance(chain, tasks, frame, at.pose, world, factors, numbers, layers, kinds)
-    return own + of_start(factors, *from_start(frame, at, parent_rotations(chain, world), numbers))
+    world = forward(system.chain, at.pose, frame.offsets)
+    own = _balance(system, frame, at.pose, world, factors)
+    return own + of_start(factors, *from_start(frame, at, parent_rotations(system.chain, world), system.numbers))
 
 
-def _balance(
-    chain: Chain,
-    tasks: Tasks,
-    frame: Frames,
-    pose: Pose,
-    world: World,
-    factors: Factors,
-    numbers: Numbers,
-    layers: int,
-    kinds: Kinds,
-) -> Float[Array, " n"]:
+def _balance(system: System, frame: Frames, pose: Pose, world: World, factors: Factors) -> Float[Array, " n"]:
     """The part of the conditions that does not look at the frame before."""
+    chain, tasks, numbers, layers, kinds = system
     seen = look(tasks, frame.goals, world)
-    r = residuals(tasks, frame.goals, seen, kinds).reshape(-1)
     q = factors.basis.rows
-    member = _members(jnp.repeat(tasks.layer, 3), layers, r.dtype)
-    load = jnp.concatenate([r[:, None] * member, jnp.zeros_like(r[:, None])], axis=1) - factors.multipliers.T
+    load, member = _loads(system, frame, seen, factors)
     gains = wrench(chain, tasks, frame.goals, world, seen, kinds, load)  # (n, N + 1)
     own = jnp.sum(times(q, gains[:, :layers]) * member, axis=1)
     free = _pull(frame, pose, parent_rotations(chain, world), numbers) + gains[:, layers]
     return times(q.T, times(factors.solve, own) - times(q, free)) + free
+
+
+def _loads(
+    system: System, frame: Frames, seen: Seen, factors: Factors
+) -> tuple[Float[Array, "m layers1"], Float[Array, "m layers"]]:
+    """What each layer's conditions, and last the attraction's, load the rows with: its own residuals, less the multipliers of those
+    above. And 1 where a row is of a layer."""
+    r = residuals(system.tasks, frame.goals, seen, system.kinds).reshape(-1, 1)
+    member = _members(jnp.repeat(system.tasks.layer, 3), system.layers, r.dtype)
+    return jnp.concatenate([r * member, jnp.zeros_like(r)], axis=1) - factors.multipliers.T, member
 
 
 def _pull(frame: Frames, pose: Pose, parent: Float[Array, "p 3 3"], numbers: Numbers) -> Float[Array, " n"]:
@@ -161,36 +160,19 @@ def of_start(factors: Factors, back: Float[Array, " n"], travel: Float[Array, " 
     return back - times(q.T, times(q, back) + held)
 
 
-def derivative(
-    chain: Chain,
-    tasks: Tasks,
-    frame: Frames,
-    at: Solved,
-    factors: Factors,
-    numbers: Numbers,
-    layers: int,
-    kinds: Kinds,
-) -> Float[Array, "n n"]:
+def derivative(system: System, frame: Frames, at: Solved, factors: Factors) -> Float[Array, "n n"]:
     """How `balance` changes with a step of the pose, along world axes; along faint directions it counts as if they moved.
 
     In closed form where all constraints are in the world and none is a look-at, else by `jacfwd`.
     """
-    form = _by_jacfwd if kinds.relative or kinds.looks else _in_closed_form
-    change = form(chain, tasks, frame, at, factors, numbers, layers, kinds)
+    form = _by_jacfwd if system.kinds.relative or system.kinds.looks else _in_closed_form
+    change = form(system, frame, at, factors)
     q = factors.basis.rows
     return change - times(q.T, times(factors.solve, times(factors.hold - factors.dragged, q)))
 
 
-def _by_jacfwd(
-    chain: Chain,
-    tasks: Tasks,
-    frame: Frames,
-    at: Solved,
-    factors: Factors,
-    numbers: Numbers,
-    layers: int,
-    kinds: Kinds,
-) -> Float[Array, "n n"]:
+def _by_jacfwd(system: System, frame: Frames, at: Solved, factors: Factors) -> Float[Array, "n n"]:
+    chain = system.chain
     world = forward(chain, at.pose, frame.offsets)
     parent = parent_rotations(chain, world)
     free = chain._replace(limits=None)
@@ -198,31 +180,21 @@ def _by_jacfwd(
     def after(step: Float[Array, " n"]) -> Float[Array, " n"]:
         pose = moved(free, at.pose, parent, step[:, None])
         there = nearby(chain, world, step)
-        own = _balance(chain, tasks, frame, pose, there, factors, numbers, layers, kinds)
-        past = from_start(frame, at._replace(pose=pose), parent_rotations(chain, there), numbers)
+        own = _balance(system, frame, pose, there, factors)
+        past = from_start(frame, at._replace(pose=pose), parent_rotations(chain, there), system.numbers)
         return own + of_start(factors, *past)
 
     return jax.jacfwd(after)(jnp.zeros(3 + 3 * parent.shape[0], parent.dtype))
 
 
-def _in_closed_form(
-    chain: Chain,
-    tasks: Tasks,
-    frame: Frames,
-    at: Solved,
-    factors: Factors,
-    numbers: Numbers,
-    layers: int,
-    kinds: Kinds,
-) -> Float[Array, "n n"]:
+def _in_closed_form(system: System, frame: Frames, at: Solved, factors: Factors) -> Float[Array, "n n"]:
+    chain, tasks, numbers, layers, kinds = system
     world = forward(chain, at.pose, frame.offsets)
     parent = parent_rotations(chain, world)
     seen = look(tasks, frame.goals, world)
-    r = residuals(tasks, frame.goals, seen, kinds).reshape(-1)
     rows = jnp.repeat(tasks.layer, 3)
     q, factors_r = factors.basis
-    member = _members(rows, layers, r.dtype)
-    load = jnp.concatenate([r[:, None] * member, jnp.zeros_like(r[:, None])], axis=1) - factors.multipliers.T
+    load, member = _loads(system, frame, seen, factors)
     bent = stiffness(chain, tasks, frame.goals, world, seen, kinds, load)  # (N + 1, n, n)
     # residuals change with every joint that moves them, recruited or not
     all_joints = tasks._replace(
@@ -230,7 +202,7 @@ def _in_closed_form(
     )
     free_goals = frame.goals._replace(root_free=jnp.ones_like(frame.goals.root_free))
     every = jacobian(chain, all_joints, free_goals, world, seen, kinds)
-    same = (rows[:, None] == rows[None, :]).astype(r.dtype)
+    same = (rows[:, None] == rows[None, :]).astype(load.dtype)
     curved = jnp.einsum("mn,ml,lnk->mk", q, member, bent[:layers], precision="highest")
     own = curved - jnp.matmul((factors_r * same).T, every, precision="highest")
     stays, stays_root = _staying(frame, numbers)
@@ -255,7 +227,7 @@ def _attraction_change(chain: Chain, z: Float[Array, " n"]) -> Float[Array, "n n
     series = jnp.asarray(1 / 12, z.dtype) + angle2 / 720
     c = jnp.where(small, series, (1 - angle / 2 / jnp.tan(angle / 2)) / jnp.where(small, 1, angle2))
     eye = jnp.eye(3, dtype=z.dtype)
-    hat = jnp.stack([_cross(jnp.broadcast_to(e, v.shape), v) for e in eye], axis=2)  # t -> t x v, that is -[v]x
+    hat = jnp.stack([jnp.cross(jnp.broadcast_to(e, v.shape), v) for e in eye], axis=2)  # t -> t x v, that is -[v]x
     square = v[:, :, None] * v[:, None, :] - angle2[:, None, None] * eye
     own = -(eye - hat / 2 + c[:, None, None] * square)
     strict = chain.above - jnp.eye(joints, dtype=z.dtype)
@@ -275,19 +247,13 @@ def nearby(chain: Chain, world: World, step: Float[Array, " n"]) -> World:
     turn = step[3:].reshape(joints, 3)
     place = world[:joints, :, 3, 0]
     turned = jnp.sum(chain.above[:, :, None] * turn[None], axis=1)
-    slid = jnp.sum(chain.above[:, :, None] * _cross(turn, place)[None], axis=1)
-    shift = _cross(turned, place) - slid + step[:3]
+    slid = jnp.sum(chain.above[:, :, None] * jnp.cross(turn, place)[None], axis=1)
+    shift = jnp.cross(turned, place) - slid + step[:3]
     change = jnp.concatenate(
-        [_cross(turned[:, None], jnp.swapaxes(world[:joints, :, :3, 0], 1, 2)).swapaxes(1, 2), shift[:, :, None]],
+        [jnp.cross(turned[:, None], jnp.swapaxes(world[:joints, :, :3, 0], 1, 2)).swapaxes(1, 2), shift[:, :, None]],
         axis=2,
     )
     return world.at[:joints, :, :, 0].add(change)
-
-
-def _cross(a: Float[Array, "... 3"], b: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
-    ax, ay, az = (a[..., i] for i in range(3))
-    bx, by, bz = (b[..., i] for i in range(3))
-    return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
 def _staying(frame: Frames, numbers: Numbers) -> tuple[Float[Array, " p"], Float[Array, ""]]:
@@ -307,16 +273,6 @@ def _members(rows: Int[Array, " m"], layers: int, dtype: jnp.dtype) -> Float[Arr
 def _lowest(tasks: Tasks, frame: Frames) -> Int[Array, ""]:
     """The last layer of which something is asked in this frame."""
     return jnp.max(jnp.where(frame.goals.active > 0, tasks.layer, -1))
-
-
-def _faint(
-    normal: Float[Array, "m m"], sigma2: Float[Array, " m"], strength: Float[Array, " m"]
-) -> Float[Array, "m m"]:
-    """`strength^2 / (1 + (s / sigma)^2)^8` along each singular direction of the layers' own rows, `normal` being R_ii' R_ii."""
-    fade = inverse(jnp.eye(len(sigma2), dtype=normal.dtype) + normal / safe_sqrt(sigma2[:, None] * sigma2[None, :]))
-    fade = times(fade, fade)
-    fade = times(fade, fade)
-    return strength[:, None] * strength[None, :] * times(fade, fade)
 
 
 def _multipliers(r: Float[Array, "m m"], sought: Float[Array, "m k"], jac: Float[Array, "m n"]) -> Float[Array, "m k"]:

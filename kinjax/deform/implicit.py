@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..errors import OptionError
 from .chain import Chain, Pose, forward, moved, parent_rotations
-from .conditions import Factors, Numbers, Solved, balance, derivative, factors_of, from_start, of_start
+from .conditions import Factors, Numbers, Solved, System, balance, derivative, factors_of, from_start, of_start
 from .sequence import Carried, Frames
 from .tasks import Kinds, Tasks
 
@@ -62,19 +62,18 @@ def attach(asked: Asked, numbers: Numbers, found: tuple[Poses, Bool[Array, " f"]
 @attach.defjvp
 def _attached(static: Static, primals: Any, tangents: Any) -> tuple[Poses, Poses]:
     asked, numbers, (poses, sound) = once(primals)
-    change = tangents[0]
     places, known = _places(asked, poses, sound)
-    asked, change = _finite(asked, change, sound & known)
-    factors, response = _each(
-        lambda frame, at: _frame(asked.chain, asked.tasks, frame, at, numbers, static), asked.frames, places
-    )
+    change = _finite_change(tangents[0], asked, sound & known)
+    asked = _finite(asked, sound & known)
+    system = _system(asked, numbers, static)
+    factors, response = _each(partial(_frame, system), asked.frames, places)
 
     def moves(frame: Frames, at: Solved, factors: Factors, by: Any) -> Float[Array, " n"]:
         """How the conditions move with everything but the pose itself and the pose before."""
 
         def all_of(chain: Chain, tasks: Tasks, frame: Frames, last: Pose, before: Pose) -> Float[Array, " n"]:
             there = at._replace(last=last, before=before)
-            return balance(chain, tasks, frame, there, factors, numbers, static.layers, static.kinds)
+            return balance(system._replace(chain=chain, tasks=tasks), frame, there, factors)
 
         primal = asked.chain, asked.tasks, frame, at.last, at.before
         return jax.jvp(all_of, primal, (change.chain, change.tasks, *by))[1]
@@ -110,8 +109,13 @@ def distance(
     would change; infinite where the solver was not sound."""
     asked, numbers, poses = jax.lax.stop_gradient((asked, numbers, poses))
     places, known = _places(asked, poses, sound)
-    asked, _ = _finite(asked, asked, sound & known)
-    left = _each(lambda frame, at: _left(asked.chain, asked.tasks, frame, at, numbers, static), asked.frames, places)
+    asked = _finite(asked, sound & known)
+    system = _system(asked, numbers, static)
+
+    def missing(frame: Frames, at: Solved) -> Array:
+        return jnp.max(jnp.abs(balance(system, frame, at, factors_of(system, frame, at))))
+
+    left = _each(missing, asked.frames, places)
     return jnp.where(sound & known & jnp.isfinite(left), left, jnp.inf)
 
 
@@ -122,21 +126,18 @@ def settled(
     asked, numbers, poses = jax.lax.stop_gradient((asked, numbers, poses))
     places, known = _places(asked, poses, sound)
     fine = sound & known
-    clean, _ = _finite(asked, asked, fine)
-    free = clean.chain._replace(limits=None)
+    clean = _finite(asked, fine)
+    system, free = _system(clean, numbers, static), clean.chain._replace(limits=None)
 
     def frame(x: Frames, at: Solved) -> Pose:
         def missing(pose: Pose) -> tuple[Factors, Array]:
             there = at._replace(pose=pose)
-            factors = factors_of(clean.chain, clean.tasks, x, there, numbers, static.layers, static.kinds)
-            return factors, balance(clean.chain, clean.tasks, x, there, factors, numbers, static.layers, static.kinds)
+            factors = factors_of(system, x, there)
+            return factors, balance(system, x, there, factors)
 
         def step(_: Any, state: tuple[Pose, Factors, Array]) -> tuple[Pose, Factors, Array]:
             pose, factors, left = state
-            there = at._replace(pose=pose)
-            response = _factorized(
-                derivative(clean.chain, clean.tasks, x, there, factors, numbers, static.layers, static.kinds)
-            )
+            response = _factorized(derivative(system, x, at._replace(pose=pose), factors))
             parent = parent_rotations(clean.chain, forward(clean.chain, pose, x.offsets))
             tried = moved(free, pose, parent, response.to(left)[:, None])
             new = (tried, *missing(tried))
@@ -152,9 +153,8 @@ def settled(
     )
 
 
-def _left(chain: Chain, tasks: Tasks, frame: Frames, at: Solved, numbers: Numbers, static: Static) -> Array:
-    factors = factors_of(chain, tasks, frame, at, numbers, static.layers, static.kinds)
-    return jnp.max(jnp.abs(balance(chain, tasks, frame, at, factors, numbers, static.layers, static.kinds)))
+def _system(asked: Asked, numbers: Numbers, static: Static) -> System:
+    return System(asked.chain, asked.tasks, numbers, static.layers, static.kinds)
 
 
 class _Response(NamedTuple):
@@ -170,13 +170,10 @@ class _Response(NamedTuple):
         return jnp.where(self.good, step, 0)
 
 
-def _frame(
-    chain: Chain, tasks: Tasks, frame: Frames, at: Solved, numbers: Numbers, static: Static
-) -> tuple[Factors, _Response]:
+def _frame(system: System, frame: Frames, at: Solved) -> tuple[Factors, _Response]:
     """Factors, and how the pose responds."""
-    factors = factors_of(chain, tasks, frame, at, numbers, static.layers, static.kinds)
-    a = derivative(chain, tasks, frame, at, factors, numbers, static.layers, static.kinds)
-    return factors, _factorized(a)
+    factors = factors_of(system, frame, at)
+    return factors, _factorized(derivative(system, frame, at, factors))
 
 
 def _factorized(a: Float[Array, "n n"]) -> _Response:
@@ -223,41 +220,57 @@ def _earlier(x: Pose, first: Pose, known: Bool[Array, " f"]) -> Pose:
     return jax.tree.map(pick, x, first)
 
 
-def _finite(asked: Asked, change: Asked, good: Bool[Array, " f"]) -> tuple[Asked, Asked]:
-    """Frames that were not solved ask for nothing but their input; what is not finite is at rest and does not change."""
+def _finite(asked: Asked, good: Bool[Array, " f"]) -> Asked:
+    """Frames that were not solved ask for nothing but their input; what is not finite is at rest."""
+    frames = asked.frames
+    still, unit = jnp.eye(4, 1, dtype=frames.root.dtype), jnp.eye(1, 4, dtype=frames.root.dtype)[0]
+    return asked._replace(frames=_kept(frames, _usable(frames, good), still, unit))
 
-    def clean(frames: Frames, safe: Frames) -> Frames:
-        def fill(x: Array, ok: Array, value: Array | float) -> Array:
-            return jnp.where(ok.reshape(-1, *[1] * (x.ndim - 1)), x, value)
 
-        def finite(x: Array) -> Array:
-            return jnp.isfinite(x).all(tuple(range(1, x.ndim)))
+def _finite_change(change: Asked, asked: Asked, good: Bool[Array, " f"]) -> Asked:
+    """What belongs to it of a change: what `_finite` puts in the place of something does not change."""
+    none = jnp.zeros((), asked.frames.root.dtype)
+    return change._replace(frames=_kept(change.frames, _usable(asked.frames, good), none, none))
 
-        tangent = frames is not safe
-        still = 0.0 if tangent else jnp.eye(4, 1, dtype=safe.root.dtype)[None]
-        own = finite(safe.rotations) & finite(safe.root)
-        goals, sane = frames.goals, safe.goals
-        place = jnp.isfinite(sane.place).all(-1, keepdims=True)
-        turn = jnp.isfinite(sane.rotation).all(-1, keepdims=True)
-        unit = 0.0 if tangent else jnp.eye(1, 4, dtype=safe.root.dtype)[None]
-        goals = goals._replace(
-            place=jnp.where(place & good[:, None, None], goals.place, 0),
-            rotation=jnp.where(turn & good[:, None, None], goals.rotation, unit),
-            active=fill(goals.active, good, 0),
-            mass_point=jnp.where(jnp.isfinite(sane.mass_point), goals.mass_point, 0),
-        )
-        return frames._replace(
-            rotations=fill(frames.rotations, own, still),
-            root=fill(frames.root, own, 0),
-            offsets=jnp.where(jnp.isfinite(safe.offsets), frames.offsets, 0),
-            controlled=fill(frames.controlled, good, 0),
-            root_controlled=fill(frames.root_controlled, good, 0),
-            goals=goals,
-        )
 
-    return (
-        asked._replace(frames=clean(asked.frames, asked.frames)),
-        change._replace(frames=clean(change.frames, asked.frames)) if change is not asked else asked,
+class _Usable(NamedTuple):
+    """Which parts of what is asked of F frames count, in shapes that broadcast to theirs."""
+
+    input: Bool[Array, " f"]
+    asked: Bool[Array, " f"]
+    place: Bool[Array, "f b 1"]
+    turn: Bool[Array, "f b 1"]
+    mass: Bool[Array, "f m 3"]
+    offsets: Bool[Array, "f p 3"]
+
+
+def _usable(frames: Frames, good: Bool[Array, " f"]) -> _Usable:
+    goals, there = frames.goals, good[:, None, None]
+    return _Usable(
+        jnp.isfinite(frames.rotations).all((1, 2)) & jnp.isfinite(frames.root).all(1),
+        good,
+        there & jnp.isfinite(goals.place).all(-1, keepdims=True),
+        there & jnp.isfinite(goals.rotation).all(-1, keepdims=True),
+        jnp.isfinite(goals.mass_point),
+        jnp.isfinite(frames.offsets),
+    )
+
+
+def _kept(frames: Frames, of: _Usable, still: Array, unit: Array) -> Frames:
+    """The parts that count; for the others 0, `still` for the input's rotations and `unit` for those asked for."""
+    goals = frames.goals
+    return frames._replace(
+        rotations=jnp.where(of.input[:, None, None], frames.rotations, still),
+        root=jnp.where(of.input[:, None], frames.root, 0),
+        offsets=jnp.where(of.offsets, frames.offsets, 0),
+        controlled=jnp.where(of.asked[:, None], frames.controlled, 0),
+        root_controlled=jnp.where(of.asked, frames.root_controlled, 0),
+        goals=goals._replace(
+            place=jnp.where(of.place, goals.place, 0),
+            rotation=jnp.where(of.turn, goals.rotation, unit),
+            active=jnp.where(of.asked[:, None], goals.active, 0),
+            mass_point=jnp.where(of.mass, goals.mass_point, 0),
+        ),
     )
 
 

@@ -111,12 +111,19 @@ def factorize(
     strength, sigma = drag
     used = times(same.astype(own.dtype), (jnp.sum(jacobian * jacobian, axis=1) > 0).astype(own.dtype))
     sigma2 = jnp.where(used > 0, sigma**2 * size2 / jnp.maximum(used, 1), jnp.ones_like(size2))
-    fade = inverse(jnp.eye(len(lambda2), dtype=own.dtype) + normal / safe_sqrt(sigma2[:, None] * sigma2[None, :]))
-    fade = times(fade, fade)
-    fade = times(fade, fade)
-    hold = (strength[:, None] * strength[None, :]) * times(fade, fade)
+    hold = fading(normal, sigma2, strength)
     solve = inverse(normal + jnp.diag(lambda2) + hold)
     return Layered(basis, times(solve, own.T), -times(solve, times(hold, basis.rows @ travel)), carry)
+
+
+def fading(
+    normal: Float[Array, "m m"], sigma2: Float[Array, " m"], strength: Float[Array, " m"]
+) -> Float[Array, "m m"]:
+    """`strength^2 / (1 + (s / sigma)^2)^8` along each singular direction, of value `s`, of the layers' own rows; normal: R_ii' R_ii."""
+    fade = inverse(jnp.eye(len(sigma2), dtype=normal.dtype) + normal / safe_sqrt(sigma2[:, None] * sigma2[None, :]))
+    fade = times(fade, fade)
+    fade = times(fade, fade)
+    return strength[:, None] * strength[None, :] * times(fade, fade)
 
 
 def inverse(a: Float[Array, "m m"]) -> Float[Array, "m m"]:

@@ -59,12 +59,12 @@ def solve(
 ) -> Run:
     """All frames of one clip. old: an earlier run over the same motion; pieces that would come out the same are its own."""
     dtype = np.dtype(settings.precision)
-    chain, tasks, cast = (_cast(t, dtype) for t in (plan.chain, plan.tasks, frames))
+    chain, tasks, cast = (as_dtype(t, dtype) for t in (plan.chain, plan.tasks, frames))
     static = {"layers": plan.layers, "kinds": plan.kinds, "attract": (settings.attract, settings.attract_root)}
-    numbers = _solving(settings, dtype)
+    numbers = solver_numbers(settings, dtype)
     count = len(frames.root)
     same = _unchanged(frames, asked, plan, old)
-    pose = _begin(cast.rotations[0], cast.root[0], plan.layers)
+    pose = begin_pose(cast.rotations[0], cast.root[0], plan.layers)
     out: list[Any] = []
     linked = True  # the pose that enters this piece is the one that entered it in the old run
     for begin in range(0, count, PIECE):
@@ -72,7 +72,7 @@ def solve(
         if old is not None and linked and same[begin:end].all():
             piece = _taken(old, plan, begin, end)
         else:
-            _, piece = _solve(chain, tasks, _piece(cast, begin, end), pose, numbers, **static)
+            _, piece = _solve(chain, tasks, piece_of(cast, begin, end), pose, numbers, **static)
             piece = jax.tree.map(lambda x, n=end - begin: np.asarray(x)[:n], piece)
         out.append(piece)
         pose = _last(piece, cast, begin, pose)
@@ -85,17 +85,17 @@ def solve_many(plans: Sequence[Plan], settings: Settings, tell: Callable[[int], 
     """Several clips side by side; their plans have arrays of the same shapes (frames apart)."""
     dtype = np.dtype(settings.precision)
     static = {"layers": plans[0].layers, "kinds": plans[0].kinds, "attract": (settings.attract, settings.attract_root)}
-    numbers = _solving(settings, dtype)
-    cast = [_cast(p.frames, dtype) for p in plans]
+    numbers = solver_numbers(settings, dtype)
+    cast = [as_dtype(p.frames, dtype) for p in plans]
     chain, tasks = (
-        _stack([_cast(t, dtype) for t in ts]) for ts in ([p.chain for p in plans], [p.tasks for p in plans])
+        _stack([as_dtype(t, dtype) for t in ts]) for ts in ([p.chain for p in plans], [p.tasks for p in plans])
     )
     counts = [len(p.frames.root) for p in plans]
-    pose = _stack([_begin(f.rotations[0], f.root[0], plans[0].layers) for f in cast])
+    pose = _stack([begin_pose(f.rotations[0], f.root[0], plans[0].layers) for f in cast])
     out: list[Any] = []
     for begin in range(0, max(counts), PIECE):
         pieces = _stack(
-            [_piece(f, min(begin, n - 1), min(begin + PIECE, n), begin >= n) for f, n in zip(cast, counts, strict=True)]
+            [piece_of(f, min(begin, n - 1), min(begin + PIECE, n), begin >= n) for f, n in zip(cast, counts, strict=True)]
         )
         pose, piece = _solve_many(chain, tasks, pieces, pose, numbers, **static)
         out.append(jax.tree.map(np.asarray, piece))
@@ -104,12 +104,14 @@ def solve_many(plans: Sequence[Plan], settings: Settings, tell: Callable[[int], 
     return [jax.tree.map(lambda x, i=i, n=n: x[i, :n], whole) for i, n in enumerate(counts)]
 
 
-def _solving(settings: Settings, dtype: np.dtype) -> Solving:
+def solver_numbers(settings: Settings, dtype: np.dtype) -> Solving:
+    """The settings that are data of the compiled program."""
     values: Any = [np.asarray(getattr(settings, n), np.int32 if n == "iterations" else dtype) for n in Solving._fields]
     return Solving(*values)
 
 
-def _cast(tree: Any, dtype: np.dtype) -> Any:
+def as_dtype(tree: Any, dtype: np.dtype) -> Any:
+    """A tree of arrays with its floating-point ones in another precision."""
     return jax.tree.map(lambda x: x.astype(dtype) if np.issubdtype(x.dtype, np.floating) else x, tree)
 
 
@@ -117,7 +119,7 @@ def _stack(trees: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *x: np.stack(x), *trees)
 
 
-def _begin(rotations: np.ndarray, root: np.ndarray, layers: int) -> Any:
+def begin_pose(rotations: np.ndarray, root: np.ndarray, layers: int) -> Any:
     """What the first frame starts from; parts of it that are not finite begin at rest."""
     q = np.where(np.isfinite(rotations).all(0), rotations, np.eye(4, 1, dtype=rotations.dtype))
     place: Any = np.where(np.isfinite(root), root, 0)[:, None]
@@ -127,7 +129,7 @@ def _begin(rotations: np.ndarray, root: np.ndarray, layers: int) -> Any:
     return Carried(pose, pose, ones[1:], ones[0])
 
 
-def _piece(frames: Any, begin: int, end: int, empty: bool = False) -> Any:
+def piece_of(frames: Any, begin: int, end: int, empty: bool = False) -> Any:
     """Frames `begin..end-1` filled up to `PIECE` with copies of the last, of which nothing is asked (of none, if `empty`)."""
     piece = jax.tree.map(lambda x: x[begin:end], frames)
     more = PIECE - (end - begin)

@@ -189,7 +189,7 @@ def jacobian(chain: Chain, tasks: Tasks, goals: Goals, world: World, seen: Seen,
     """
     joints = world.shape[0] - 1
     rows = 3 * tasks.kind.shape[0]
-    arm, body, rootward = _levers(chain, tasks, seen, world[:joints, :, 3, 0])
+    arm, body, rootward = levers(chain, tasks, seen, world[:joints, :, 3, 0])
     directions, turns = _directions(tasks, goals, seen, kinds)  # A and B, (B, 3 rows, 3)
     scale = _scale(tasks, goals)[:, :, None]
     directions = directions * scale
@@ -210,7 +210,7 @@ def wrench(
 ) -> Float[Array, "n k"]:
     """`J' load` for several loads on the rows, without the Jacobian `J`: forces at the points, and their moments about the joints."""
     joints = world.shape[0] - 1
-    arm, body, rootward = _levers(chain, tasks, seen, world[:joints, :, 3, 0])
+    arm, body, rootward = levers(chain, tasks, seen, world[:joints, :, 3, 0])
     directions, turns = _directions(tasks, goals, seen, kinds)
     load = load.reshape(-1, 3, load.shape[-1]) * _scale(tasks, goals)[:, :, None]
 
@@ -237,7 +237,7 @@ def stiffness(
     deeper, `d/dw_k (arm_j x f) = [f]x [arm_deeper]x = arm f' - (arm . f) I`.
     """
     joints = world.shape[0] - 1
-    arm, _, _ = _levers(chain, tasks, seen, world[:joints, :, 3, 0])
+    arm, _, _ = levers(chain, tasks, seen, world[:joints, :, 3, 0])
     directions, _ = _directions(tasks, goals, seen, kinds)
     load = load.reshape(-1, 3, load.shape[-1]) * _scale(tasks, goals)[:, :, None]
     force = jnp.einsum("bri,brk->bki", directions, load, precision="highest")
@@ -256,7 +256,7 @@ def stiffness(
     return jnp.zeros((load.shape[-1], 3 + n, 3 + n), arm.dtype).at[:, 3:, 3:].set(turned.reshape(-1, n, n))
 
 
-def _levers(
+def levers(
     chain: Chain, tasks: Tasks, seen: Seen, p: Float[Array, "p 3"]
 ) -> tuple[Float[Array, "b p 3"], Float[Array, "b p"], Float[Array, " b"]]:
     """For each constraint and joint the arm on which the joint turns the point, how much of its turn the body takes, and how

@@ -44,7 +44,7 @@ from .reporting import make_report
 from .results import Deformation
 from .sequence import Solved
 from .settings import Settings
-from .solving import _cast
+from .solving import as_dtype
 from .tasks import Kinds
 
 
@@ -158,7 +158,7 @@ def _problem(plan: Plan, weights: Any, ratio: float, dtype: np.dtype) -> tuple[A
     moves = np.asarray(float(frames.root_controlled.any()))
     numbers = jax.tree.map(np.asarray, weights)
     arrays: Any = plan.chain._replace(limits=None), tasks, filled, spread, moves, there.astype(float), numbers
-    return _cast(Problem(*arrays), dtype), free
+    return as_dtype(Problem(*arrays), dtype), free
 
 
 def _start(plan: Plan, problem: Any, free: np.ndarray, motion: Motion, start: Motion | None) -> np.ndarray:

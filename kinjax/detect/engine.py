@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..kinematics import world_transforms
+from ..forward import world_transforms
 from ..lengths import BLOCK
 from ..numerics import computed_once, packed_bits
 from ..rotations import cross, normalize, rotate
@@ -159,15 +159,15 @@ def _thresholds(
     given: tuple[Pattern, ...],
 ) -> tuple[tuple[Pattern, ...], tuple[Array, ...], tuple[tuple[Array, Array], ...]]:
     """Step 4: pattern, template marks and thresholds of each type that has one (space first, then line and point)."""
-    if plan.method == "paper":
-        low = jnp.broadcast_to(noise.smallest_floor(numbers.rate.dtype), nu[0].shape)
-        least, most, margin = (low, low), (jnp.full_like(low, jnp.inf),) * 2, jnp.ones_like(numbers.margin)
-        floor = (jnp.maximum(low, numbers.sigma_floor), jnp.maximum(low, numbers.eps_floor))
-    else:
-        width = jnp.asarray(2.5 * (2 / (2 * plan.mean + 1)) ** 0.5, numbers.rate.dtype) * numbers.rate / plan.span
-        jitter = width * nu[1], width * nu[0]
-        floor = jnp.hypot(numbers.sigma_floor, jitter[0]), jnp.hypot(numbers.eps_floor, jitter[1])
-        least, most, margin = floor, (numbers.sigma_cap + jitter[0], numbers.eps_cap + jitter[1]), numbers.margin
+    least, floor, most, margin = noise.bounds(
+        plan.method == "paper",
+        (numbers.sigma_floor, numbers.eps_floor),
+        (numbers.sigma_cap, numbers.eps_cap),
+        numbers.margin,
+        numbers.rate,
+        (plan.span, plan.mean),
+        nu,
+    )
     middle = jnp.arange(valid.shape[-1], dtype=jnp.int32).astype(numbers.rate.dtype) + (
         0.5 if plan.method == "paper" else plan.span / 2
     )

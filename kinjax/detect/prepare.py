@@ -172,6 +172,18 @@ def padded_clip(rotation: np.ndarray, position: np.ndarray, valid: np.ndarray, p
     return Clip(*out)
 
 
+def used_joints(motion: Motion, objects: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """The joints that objects need, themselves and those above them, in the skeleton's order; and the rows of the motion's
+    translations that are theirs."""
+    top = motion.skeleton.topology
+    needed: set[int] = set()
+    for j in objects:
+        while j >= 0 and j not in needed:
+            needed.add(j)
+            j = top.parents[j]
+    return tuple(sorted(needed)), tuple(k for k, j in enumerate(top.translated) if j in needed)
+
+
 def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool, padded: Padded) -> Prepared:
     """A motion as the engine takes it: only the objects and their ancestors, so that one hand costs one arm."""
     check_rate(float(motion.rate))
@@ -180,18 +192,13 @@ def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool, 
     at = list(dict.fromkeys(find_name(n, top.names, "joint", motion.name) for n in names))
     if not at:
         raise OptionError("no object to look at")
-    needed = set()
-    for j in at:
-        while j >= 0 and j not in needed:
-            needed.add(j)
-            j = top.parents[j]
-    joints = sorted(needed)
+    joints, rows = used_joints(motion, at)
     new = {old: i for i, old in enumerate(joints)}
-    moving = [(k, j) for k, j in enumerate(top.translated) if j in new]
+    moving = [top.translated[k] for k in rows]
     dtype, frames = working_dtype(), motion.frames
     length, room = padded(frames + BLOCK), 8 * -(-len(joints) // 8)
     q, t = np.moveaxis(np.asarray(motion.rotations), 0, -1), np.asarray(motion.translations)
-    t = np.asarray(t[:, [k for k, _ in moving]], float)
+    t = np.asarray(t[:, list(rows)], float)
     valid: Any = np.ones(frames, bool)
     rotations = np.zeros((room, 4, length), dtype)
     for i, j in enumerate(joints):
@@ -199,7 +206,7 @@ def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool, 
     rotations[:, 0, frames:] = rotations[len(joints) :, 0] = 1
     if not (np.isfinite(rotations).all() and np.isfinite(t).all()):  # frame by frame takes three times as long
         valid = np.isfinite(rotations[..., :frames]).all((0, 1)) & np.isfinite(t).all((1, 2))
-    root = np.array([top.parents[j] < 0 for _, j in moving])
+    root = np.array([top.parents[j] < 0 for j in moving])
     origin = t[np.argmax(valid), int(np.argmax(root))] if near and valid.any() and root.any() else np.zeros(3)
     t = t - root[:, None] * origin
     if not valid.all():
@@ -210,7 +217,7 @@ def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool, 
     mask = np.zeros(length, bool)
     mask[:frames] = valid
     offsets = np.zeros((room, 3), dtype)
-    offsets[: len(joints)] = np.asarray(motion.skeleton.offsets)[joints]
+    offsets[: len(joints)] = np.asarray(motion.skeleton.offsets)[list(joints)]
     parents = np.full(room, -1, np.int32)
     parents[: len(joints)] = [new.get(top.parents[j], -1) for j in joints]
     lanes = 1 << (len(at) - 1).bit_length()
@@ -223,7 +230,7 @@ def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool, 
         mask,
         offsets,
         parents,
-        np.array([new[j] for _, j in moving], np.int32),
+        np.array([new[j] for j in moving], np.int32),
         index,
         centers,
     )

@@ -15,9 +15,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ..components import Parts, conjugate, matrix, vector_of_product
 from ..detect.displacements import shifted, spikes
 from ..detect.interface import Clip, Joints, Numbers
-from ..detect.noise import smallest_floor
+from ..detect.noise import bounds
 from ..lengths import BLOCK
 from ..numerics import safe_sqrt
 from ..rotations import dot
@@ -25,7 +26,7 @@ from .body import joint_poses
 from .instantaneous import Limits, soft_instantaneous
 from .lmeds import soft_lmeds
 from .merging import frames_and_edges, soft_merge, soft_opening
-from .parts import Parts, conjugate, held, matrix_elements, mean_pose, normalize, vector_of_product
+from .parts import held, mean_pose, normalize
 from .quantile import smooth_quantile
 from .settling import soft_settle
 from .steps import smooth_maximum, smooth_minimum
@@ -155,7 +156,7 @@ def data_noise(
 
     # one row at a time, of a loop: together they would leave the cache, and the slowest search would hold up all
     nu_t = safe_sqrt(jnp.sum(jax.lax.map(variance, jnp.stack(t)), axis=0))
-    nu_r = safe_sqrt(jnp.sum(jax.lax.map(variance, jnp.stack(matrix_elements(q))), axis=0) / 2)
+    nu_r = safe_sqrt(jnp.sum(jax.lax.map(variance, jnp.stack(matrix(q))), axis=0) / 2)
     return nu_t, nu_r
 
 
@@ -171,15 +172,15 @@ def thresholds(
     temperature: Float[Array, ""],
 ) -> Limits:
     """Step 4: `given`, or what the templates teach, or neither, and above the floor (smoothly: it never stops a gradient)."""
-    if plan.method == "paper":
-        low = jnp.broadcast_to(smallest_floor(numbers.rate.dtype), noise[0].shape)
-        floor = jnp.maximum(low, numbers.sigma_floor), jnp.maximum(low, numbers.eps_floor)
-        cap, margin = None, jnp.ones((), numbers.rate.dtype)
-    else:
-        width = jnp.asarray(2.5 * (2 / (2 * plan.mean + 1)) ** 0.5, numbers.rate.dtype) * numbers.rate / plan.span
-        jitter = width * noise[1], width * noise[0]
-        floor = jnp.hypot(numbers.sigma_floor, jitter[0]), jnp.hypot(numbers.eps_floor, jitter[1])
-        cap, margin = (numbers.sigma_cap + jitter[0], numbers.eps_cap + jitter[1]), numbers.margin
+    _, floor, cap, margin = bounds(
+        plan.method == "paper",
+        (numbers.sigma_floor, numbers.eps_floor),
+        (numbers.sigma_cap, numbers.eps_cap),
+        numbers.margin,
+        numbers.rate,
+        (plan.span, plan.mean),
+        noise,
+    )
     if given is not None:
         bottom = [f if y.ndim == 1 else f[:, None] for f, y in zip(floor, given, strict=True)]
         return Limits(*(smooth_maximum(y, f, temperature * f) for y, f in zip(given, bottom, strict=True)))
@@ -198,7 +199,7 @@ def thresholds(
     taught = jax.vmap(one)(sigma, eps, usable, belongs, templates.at)
     out = []
     for i, (y, f) in enumerate(zip(taught, floor, strict=True)):
-        if cap is not None:
+        if plan.method != "paper":
             y = smooth_minimum(y, cap[i], temperature * cap[i])
         out.append(jnp.where(templates.some, smooth_maximum(y, f, temperature * f), f))
     return Limits(*out)

@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..components import Parts
 from ..detect.displacements import shifted
 from ..numerics import running_count
 from ..rotations import dot
-from .parts import Parts
 from .steps import within
 
 

@@ -1,7 +1,6 @@
-"""Rotations and mean poses on separate components: what is differentiated is never stacked.
+"""Unit quaternions and mean poses on separate components (`components`): what is differentiated is never stacked.
 
-In and out: tuples of arrays of any one shape, (w, x, y, z) or (x, y, z). Values are those of `rotations` and `detect.displacements`;
-there a stack of components costs nothing, but the gradient of taking one apart is a padded copy for every component.
+In and out: tuples of arrays of any one shape, (w, x, y, z) or (x, y, z). Values are those of `rotations` and `detect.displacements`.
 """
 
 from __future__ import annotations
@@ -10,54 +9,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
+from ..components import Parts
 from ..detect.displacements import shifted
 from ..rotations import dot
-
-Parts = tuple[Float[Array, "..."], ...]
 
 
 def held(x: Any, never: Bool[Array, ""]) -> Any:
     """`x`, computed before anything reads it, and its gradient before anything that leads to it: `numerics.computed_once` for
     what is differentiated. `never`: False, which the compiler must not know; a branch is where it stops merging loops."""
     return jax.lax.cond(never, lambda y: jax.tree.map(lambda z: jnp.roll(z, 1, axis=-1), y), lambda y: y, x)
-
-
-def multiply(a: Parts, b: Parts) -> Parts:
-    """Hamilton product: first `b`, then `a`."""
-    aw, ax, ay, az = a
-    bw, bx, by, bz = b
-    return (aw * bw - ax * bx - ay * by - az * bz, *vector_of_product(a, b))
-
-
-def vector_of_product(a: Parts, b: Parts) -> Parts:
-    """The last three components of the Hamilton product."""
-    aw, ax, ay, az = a
-    bw, bx, by, bz = b
-    return (
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    )
-
-
-def conjugate(q: Parts) -> Parts:
-    """Inverse of a unit quaternion."""
-    return q[0], -q[1], -q[2], -q[3]
-
-
-def cross(a: Parts, b: Parts) -> Parts:
-    """Cross product."""
-    ax, ay, az = a
-    bx, by, bz = b
-    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-
-
-def rotate(q: Parts, v: Parts) -> Parts:
-    """Vectors turned by unit quaternions."""
-    t = tuple(x + x for x in cross(q[1:], v))
-    return tuple(x + q[0] * y + z for x, y, z in zip(v, t, cross(q[1:], t), strict=True))
 
 
 def normalize(q: Parts) -> Parts:
@@ -67,16 +29,6 @@ def normalize(q: Parts) -> Parts:
     parts = tuple(jnp.where(good, x, 0 if i else 1) for i, x in enumerate(q))
     scale = jax.lax.rsqrt(dot(parts, parts))
     return tuple(x * scale for x in parts)
-
-
-def matrix_elements(q: Parts) -> Parts:
-    """The nine elements of the rotation matrix of a unit quaternion, row by row."""
-    w, x, y, z = q
-    return (
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
 
 
 def mean_pose(q: Parts, t: Parts, valid: Bool[Array, "objects frames"], half: int) -> tuple[Parts, Parts]:

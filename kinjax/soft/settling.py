@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..components import Parts, conjugate, vector_of_product
 from ..detect.displacements import shifted
 from ..detect.settling import PLACE
 from ..rotations import dot
-from .parts import Parts, conjugate, vector_of_product
 from .steps import within
 
 

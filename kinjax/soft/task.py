@@ -17,9 +17,9 @@ from jaxtyping import Array, Float
 from ..annotations import Template
 from ..detect.interface import Clip, Joints, Numbers
 from ..detect.planning import numbers, template_spans, widths
-from ..detect.prepare import prepared, working_dtype
+from ..detect.prepare import prepared, used_joints, working_dtype
 from ..detect.settings import Settings
-from ..errors import OptionError, ShapeError, TemplateError, find_name
+from ..errors import OptionError, ShapeError, TemplateError
 from ..lengths import bucket
 from ..motion import Motion, Poses
 from .core import Membership, SoftPlan
@@ -168,8 +168,8 @@ def prepare(
     translated: tuple[int, ...] = ()
     root = np.zeros((0, 3))
     if isinstance(clip.arrays, Joints) and isinstance(source, Motion):
-        joints, translated = _used_joints(source, clip.names)
         top = source.skeleton.topology
+        joints, translated = used_joints(source, [top.names.index(n) for n in clip.names])
         roots = np.array([top.parents[top.translated[k]] < 0 for k in translated])
         root = np.where(roots[:, None], clip.origin[:1], 0.0)
     return Task(
@@ -185,17 +185,6 @@ def prepare(
         translated,
         settings,
     )
-
-
-def _used_joints(motion: Motion, names: Sequence[str]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """The joints that the objects need, as `detect.prepare` orders them, and which translations are theirs."""
-    top = motion.skeleton.topology
-    needed: set[int] = set()
-    for j in (find_name(n, top.names, "joint", motion.name) for n in names):
-        while j >= 0 and j not in needed:
-            needed.add(j)
-            j = top.parents[j]
-    return tuple(sorted(needed)), tuple(k for k, j in enumerate(top.translated) if j in needed)
 
 
 def _membership(templates: Sequence[Template], clip: Any, settings: Settings, span: int) -> Membership | None:
