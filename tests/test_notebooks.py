@@ -4,6 +4,7 @@ from pathlib import Path
 
 import jax
 import jupytext
+import matplotlib.pyplot as plt
 import pytest
 
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.py"))
@@ -22,3 +23,4 @@ def test_notebook_runs(path, monkeypatch, tmp_path):
             exec(compile(source, f"{path.name} cell {i}", "exec"), names)
     finally:
         jax.config.update("jax_enable_x64", before)  # a notebook sets it for good
+        plt.close("all")
