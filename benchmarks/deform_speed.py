@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 
 from benchmarks.speed import one_core
-from kinjax.cli.cache import use_fast_loops
+from kinjax.cli.cache import use_deform_flags
 
 
 def best(f: Callable[[], object], times: int) -> float:
@@ -26,7 +26,7 @@ def best(f: Callable[[], object], times: int) -> float:
 def main() -> None:
     """Measure and print."""
     one_core()
-    use_fast_loops()
+    use_deform_flags()
 
     from kinjax.deform import Position, Settings, deform, deform_many
     from kinjax.synthetic import walking_biped

@@ -101,9 +101,9 @@ def main() -> None:
     parser.add_argument("--gradient", default="implicit")
     options = parser.parse_args()
     one_core()
-    from kinjax.cli.cache import use_fast_loops
+    from kinjax.cli.cache import use_deform_flags
 
-    use_fast_loops()
+    use_deform_flags()
     import jax
 
     jax.config.update("jax_enable_x64", True)

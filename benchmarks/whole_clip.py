@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 
 from benchmarks.speed import one_core
-from kinjax.cli.cache import use_fast_loops
+from kinjax.cli.cache import use_deform_flags
 
 
 def timed(f: Callable[[], object], times: int = 3) -> tuple[float, float]:
@@ -27,7 +27,7 @@ def timed(f: Callable[[], object], times: int = 3) -> tuple[float, float]:
 def main() -> None:
     """Measure and print."""
     one_core()
-    use_fast_loops()
+    use_deform_flags()
 
     import numpy as np
 

@@ -5,15 +5,14 @@ set, if only to nothing, they are compiled as users have them.
 """
 
 import os
-from importlib.metadata import version
 from pathlib import Path
 
+from kinjax.cli.cache import plain_fusions
+
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-# two thirds of the time and half of the memory. A flag that XLA does not know ends the process: not for versions that may have
-# dropped it. (With no optimisation at all it would be a third, but XLA's results are then wrong now and then: a rest is none)
-os.environ.setdefault(
-    "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false" * (tuple(map(int, version("jaxlib").split(".")[:2])) <= (0, 10))
-)
+# two thirds of the time and half of the memory. (With no optimisation at all it would be a third, but what XLA then gives is wrong
+# now and then: bodies at rest are seen to move)
+os.environ.setdefault("XLA_FLAGS", plain_fusions())
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "programs"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from kinjax.cli import main
-from kinjax.cli.cache import FAST_LOOPS, use_fast_loops
+from kinjax.cli.cache import FAST_LOOPS, plain_fusions, use_deform_flags
 from kinjax.formats import load, save, write_annotations
 from kinjax.formats.bvh_like import write_bvh_like
 from kinjax.synthetic import walking_biped
@@ -268,24 +268,25 @@ def test_wrong_input_is_one_line(
 @pytest.mark.parametrize(
     ("before", "after"),
     [
-        ("", FAST_LOOPS),
-        ("--xla_dump_to=/x", f"--xla_dump_to=/x {FAST_LOOPS}"),
-        ("--xla_backend_extra_options=a=1", "--xla_backend_extra_options=a=1"),
+        ("", f"{FAST_LOOPS} {plain_fusions()}".strip()),
+        ("--xla_dump_to=/x", f"--xla_dump_to=/x {FAST_LOOPS} {plain_fusions()}".strip()),
+        ("--xla_backend_extra_options=a=1", f"--xla_backend_extra_options=a=1 {plain_fusions()}".strip()),
+        ("--xla_cpu_use_fusion_emitters=true", f"--xla_cpu_use_fusion_emitters=true {FAST_LOOPS}"),
     ],
 )
-def test_small_loops_are_made_fast_unless_the_user_has_said_otherwise(
+def test_flags_for_deforming_are_set_unless_the_user_has_said_otherwise(
     before: str, after: str, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv("XLA_FLAGS", before)
-    use_fast_loops()
+    use_deform_flags()
     assert os.environ["XLA_FLAGS"] == after
 
 
 def test_the_flag_is_set_before_jax_is_there(folder: Path):
     code = (
-        "import sys\nimport kinjax.cli.cache as cache\nreal = cache.use_fast_loops\n"
+        "import sys\nimport kinjax.cli.cache as cache\nreal = cache.use_deform_flags\n"
         "def seen():\n    assert 'jax' not in sys.modules\n    real()\n"
-        "cache.use_fast_loops = seen\nfrom kinjax.cli import main\nraise SystemExit(main(sys.argv[1:]))"
+        "cache.use_deform_flags = seen\nfrom kinjax.cli import main\nraise SystemExit(main(sys.argv[1:]))"
     )
     args = ["deform", str(folder / "walk.bvh"), str(folder / "nothing.toml"), "-o", str(folder / "flag.bvh")]
     done = subprocess.run([sys.executable, "-c", code, *args], capture_output=True, text=True, timeout=120)

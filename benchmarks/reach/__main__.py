@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from benchmarks.speed import one_core
-from kinjax.cli.cache import use_fast_loops
+from kinjax.cli.cache import use_deform_flags
 
 
 def main() -> int:
@@ -25,7 +25,7 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=3, help="timed runs of each solver")
     args = parser.parse_args()
     one_core()
-    use_fast_loops()  # as the command line does
+    use_deform_flags()  # as the command line does
 
     from benchmarks import peers
 

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from kinjax.cli.cache import use_fast_loops
+from kinjax.cli.cache import use_deform_flags
 from kinjax.plots import residuals_over_time, side_by_side
 
 from . import SCENES, reaching
@@ -51,7 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("-o", type=Path, default=None, dest="out", help="folder for the pictures")
     parser.add_argument("--repeats", type=int, default=3, help="warm runs, of which the fastest counts")
     options = parser.parse_args(arguments)
-    use_fast_loops()  # before the first computation
+    use_deform_flags()  # before the first computation
     if unknown := [n for n in options.names if n not in SCENES]:
         parser.error(f"no scene {unknown[0]!r}: choose from {', '.join(SCENES)}")
     lines, held = [], True

@@ -7,6 +7,7 @@ In: the environment. Out: JAX's persistent cache, set before the first computati
 from __future__ import annotations
 
 import os
+from importlib.metadata import version
 from pathlib import Path
 
 OFF = ("off", "0", "no", "none")
@@ -43,11 +44,21 @@ def cache_folder() -> Path | None:
     return folder if os.access(folder, os.W_OK) else None
 
 
-def use_fast_loops() -> None:
-    """Have XLA run small loops on the CPU in one thread each: the frame loop of a deformation is up to twice as fast.
+def plain_fusions() -> str:
+    """The flag that switches XLA's fusion emitters off: a deformation compiles in two thirds of the time and half of the memory,
+    and runs as fast (detection would run slower). "" where the installed version may not know it: XLA ends the process then."""
+    known = tuple(map(int, version("jaxlib").split(".")[:2])) <= (0, 10)
+    return "--xla_cpu_use_fusion_emitters=false" if known else ""
+
+
+def use_deform_flags() -> None:
+    """Have XLA run small loops on the CPU in one thread each (the frame loop of a deformation is up to twice as fast), and
+    compile with `plain_fusions`.
 
     XLA reads this once, so it goes before JAX. Only for commands that deform; what the user has set stays.
     """
     flags = os.environ.get("XLA_FLAGS", "")
-    if "xla_backend_extra_options" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {FAST_LOOPS}".strip()
+    for flag in (FAST_LOOPS, plain_fusions()):
+        if flag.partition("=")[0] not in flags:
+            flags = f"{flags} {flag}".strip()
+    os.environ["XLA_FLAGS"] = flags

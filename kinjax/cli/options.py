@@ -157,9 +157,9 @@ class Deform(Reading, Deforming):
 
     def run(self) -> int:
         """Do it."""
-        from .cache import use_fast_loops
+        from .cache import use_deform_flags
 
-        use_fast_loops()  # before anything imports JAX
+        use_deform_flags()  # before anything imports JAX
         from .deforming import deform_command
 
         return deform_command(self)
@@ -180,9 +180,9 @@ class Clean(Reading, Deforming, Detecting):
 
     def run(self) -> int:
         """Do it."""
-        from .cache import use_fast_loops
+        from .cache import use_deform_flags
 
-        use_fast_loops()  # before anything imports JAX
+        use_deform_flags()  # before anything imports JAX
         from .deforming import clean_command
 
         return clean_command(self)
