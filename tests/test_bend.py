@@ -95,12 +95,14 @@ def test_gradients_are_central_differences(x64, goals):
     )  # what all can have, none is weighed for
     assert all(float(jnp.abs(getattr(gradient, n)).max()) > 1e-6 for n in some)
     if goals is IN_THE_WORLD:
-        _bad_frames(bend, loss)
-        _second_order(bend, loss)
+        with pytest.raises(OptionError, match="first derivatives only"):
+            jax.jvp(jax.grad(loss), (bend.variables,), (bend.variables,))
 
 
-def _bad_frames(bend: Bend, loss) -> None:
-    """A frame that is not finite takes no part: derivatives by it are 0, those by the others finite."""
+@pytest.mark.slow
+def test_a_bad_frame_takes_no_part(x64):
+    """Derivatives by it are 0, those by the others finite."""
+    bend = Bend(MOTION, IN_THE_WORLD, EXACT, settle=5)
     v = bend.variables
     bad = replace(v, rotations=v.rotations.at[2, 3].set(jnp.nan))
     bent = bend(bad)
@@ -121,11 +123,6 @@ def _bad_frames(bend: Bend, loss) -> None:
     lost = replace(v, place=v.place.at[1, 0].set(jnp.nan))
     g = jax.grad(without)(lost)
     assert all(np.isfinite(getattr(g, n)).all() for n in ALL) and not np.asarray(g.place)[1].any()
-
-
-def _second_order(bend: Bend, loss) -> None:
-    with pytest.raises(OptionError, match="first derivatives only"):
-        jax.jvp(jax.grad(loss), (bend.variables,), (bend.variables,))
 
 
 def arm(bend_by: float = 0.5, frames: int = 2):
@@ -162,6 +159,7 @@ def test_forward_is_reverse(x64):
     assert abs(float(pushed) - by) < 1e-9 * abs(by)
 
 
+@pytest.mark.slow
 def test_implicit_is_unrolled_where_it_has_converged(x64):
     """Through every iteration, in reverse, and by the conditions of the place where they end. One frame: the next would start where
     it ends, be there at once, and have no iterations to go back through."""

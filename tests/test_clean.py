@@ -52,7 +52,7 @@ def recorded(data: Path) -> dict[str, tuple[Motion, Annotations]]:
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("02_01", ("foot", "toe")), ("35_01", ("foot", "toe")), ("cmu_12_01_walk", ("foot",))],
+    [pytest.param("02_01", ("foot", "toe"), marks=pytest.mark.slow), ("35_01", ("foot", "toe")), ("cmu_12_01_walk", ("foot",))],
     ids=lambda x: x if isinstance(x, str) else " and ".join(x),
 )
 def test_planted_feet_stand_still_in_the_file_that_is_written(

@@ -6,12 +6,14 @@ import random
 import signal
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import database_cases as cases
 import pytest
 from database_cases import bytes_of, finish, folder_of_clips, hooked, job
 
 from kinjax.database import Store, annotate
+from kinjax.database.engines import DaskWorkers, NoWorkers
 from kinjax.database.upkeep import check
 
 KILLS = int(os.environ.get("KINJAX_KILLS", "20"))
@@ -198,3 +200,15 @@ def test_a_nanny_is_killed_and_then_all(clips, cache, undisturbed, cluster, tmp_
     nanny()
     finish(job(clips, store, cache, *more), 3)
     same(store, undisturbed)
+
+
+def test_a_receipt_whose_worker_is_gone_is_not_waited_for_for_good():
+    """Dask would do the task again, but there is no worker left that could."""
+
+    def result(timeout: float) -> None:
+        raise TimeoutError
+
+    engine = DaskWorkers(1, patience=2)
+    engine.client = SimpleNamespace(status="running", scheduler_info=lambda: {"workers": {}})
+    with pytest.raises(NoWorkers, match="no Dask worker for 2 s"):
+        engine._outcome(SimpleNamespace(status="finished", result=result))

@@ -171,7 +171,9 @@ print("CHECKED")
 '''
 
 
-@pytest.mark.parametrize("engine", [DETECT, SOFT, DEFORM], ids=["detect", "soft", "deform"])
+@pytest.mark.parametrize(
+    "engine", [DETECT, SOFT, pytest.param(DEFORM, marks=pytest.mark.slow)], ids=["detect", "soft", "deform"]
+)
 def test_shape_annotations_hold_as_the_engine_runs(engine):
     done = subprocess.run([sys.executable, "-c", COMMON + engine], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-4000:]

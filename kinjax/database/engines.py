@@ -141,37 +141,47 @@ class DaskWorkers(AbstractContextManager["DaskWorkers"]):
         while running:
             future = self._next(done)
             task = running.pop(future)
-            outcome = _outcome(future)
+            outcome = self._outcome(future)
             future.release()
             send()
             yield task, outcome
 
     def _next(self, done: SimpleQueue[Any]) -> Any:
-        """The next future that is done; `NoWorkers` after `patience` seconds in which there was no worker."""
+        """The next future that is done."""
+        return self._patiently(lambda seconds: done.get(timeout=seconds), Empty)
+
+    def _outcome(self, future: Any) -> Receipt | Lost:
+        """The receipt of a future, or why there is none; what the task itself raised is raised here.
+
+        A receipt is with the worker that made it: where that is gone, Dask does the task again, if it finds another worker.
+        """
+        from distributed import KilledWorker
+
+        if future.status == "cancelled":
+            raise NoWorkers("the Dask scheduler is gone")
+        if future.status == "error":
+            error = future.exception()
+            if isinstance(error, KilledWorker):
+                return Lost("its worker ended")
+            raise error
+        try:
+            result: Receipt = self._patiently(lambda seconds: future.result(timeout=seconds), TimeoutError)
+        except KilledWorker:
+            return Lost("its worker ended")
+        return result
+
+    def _patiently(self, ask: Callable[[float], Any], not_yet: type[Exception]) -> Any:
+        """What `ask(seconds)` gives, asked again each time that it raises `not_yet`; `NoWorkers` after `patience` seconds in which
+        there was no worker."""
         without = 0.0
         while True:
             try:
-                return done.get(timeout=1.0)
-            except Empty:
+                return ask(1.0)
+            except not_yet:
                 alive = self.client.status == "running" and self.client.scheduler_info()["workers"]
                 without = 0.0 if alive else without + 1.0
                 if without >= self.patience:
                     raise NoWorkers(f"there has been no Dask worker for {self.patience:g} s") from None
-
-
-def _outcome(future: Any) -> Receipt | Lost:
-    """The receipt of a future, or why there is none; what the task itself raised is raised here."""
-    from distributed import KilledWorker
-
-    if future.status == "cancelled":
-        raise NoWorkers("the Dask scheduler is gone")
-    error = future.exception()
-    if isinstance(error, KilledWorker):
-        return Lost("its worker ended")
-    if error is not None:
-        raise error
-    result: Receipt = future.result()
-    return result
 
 
 def _in_worker(task: Task, threads: int) -> Receipt:
