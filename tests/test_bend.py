@@ -149,6 +149,7 @@ def reach(offset, gradient: str = "implicit", bend_by: float = 0.5, frames: int 
     return Bend(arm(bend_by, frames), goals, replace(EXACT, **more), gradient=gradient)
 
 
+@pytest.mark.slow
 def test_forward_is_reverse(x64):
     bend = reach((0.02, -0.05, 0.04))
     loss = scored(bend, np.ones((2, 4, 3)) * np.arange(3.0))
@@ -182,6 +183,7 @@ def test_implicit_is_unrolled_where_it_has_converged(x64):
     [((0, 2.0, 0), 0.5), ((0, 0.05, 0), 0.0), ((0.3, -0.6, 0.1), 0.2), ((0, 0, 0), 0.0), ((0, 0, 0), 0.5)],
     ids=["unreachable", "straight", "conflict", "at-rest-straight", "at-rest"],
 )
+@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)], indirect=True)
 def test_finite_and_bounded_where_nothing_is_well_conditioned(precision, offset, bend_by):
     bend = reach(offset, bend_by=bend_by, iterations=30, tolerance=1e-6, drag=0.3)
     bent = bend(bend.variables)

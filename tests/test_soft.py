@@ -47,19 +47,19 @@ def test_labels_tend_to_the_hard_ones(name):
     assert off[3] < 0.001
 
 
-def test_a_template_teaches_the_thresholds_of_the_hard_method():
+@pytest.mark.parametrize("method", ["robust", pytest.param("paper", marks=pytest.mark.slow)])
+def test_a_template_teaches_the_thresholds_of_the_hard_method(method):
     scene = synthetic.with_noise(synthetic.walking_biped(), 0.002, seed=2)
     stance = max(scene.truth.of("LeftFoot", "space"), key=lambda c: c.frames)
     template = Template("LeftFoot", stance.begin, stance.end)
-    for method in ("paper", "robust"):
-        pattern = detect.calibrate(scene.poses, [template], method=method)[0]
-        task = soft.prepare(scene.poses, ["LeftFoot"], templates=[template], method=method)
-        limits = soft.detect(task, temperature=1e-3).limits
-        # the largest kept value is one of a template's tail: at this temperature it is met to a few parts in a thousand
-        assert float(limits.sigma_max[0]) == pytest.approx(pattern.sigma_max[0], rel=0.01)
-        assert float(limits.eps_max[0]) == pytest.approx(pattern.eps_max[0], rel=0.01)
-        hard = hard_labels(scene.poses, objects=["LeftFoot"], templates=[template], method=method)
-        assert np.abs(np.asarray(soft.detect(task, temperature=1e-3).labels) - hard).mean() < 0.01
+    pattern = detect.calibrate(scene.poses, [template], method=method)[0]
+    task = soft.prepare(scene.poses, ["LeftFoot"], templates=[template], method=method)
+    found = soft.detect(task, temperature=1e-3)
+    # the largest kept value is one of a template's tail: at this temperature it is met to a few parts in a thousand
+    assert float(found.limits.sigma_max[0]) == pytest.approx(pattern.sigma_max[0], rel=0.01)
+    assert float(found.limits.eps_max[0]) == pytest.approx(pattern.eps_max[0], rel=0.01)
+    hard = hard_labels(scene.poses, objects=["LeftFoot"], templates=[template], method=method)
+    assert np.abs(np.asarray(found.labels) - hard).mean() < 0.01
 
 
 def direction(x, seed=0):

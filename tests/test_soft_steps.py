@@ -223,7 +223,7 @@ def test_the_merge_is_the_mean_over_all_pass_patterns(x64, gone, most):
     np.testing.assert_allclose(jnp.sum(soft.begins), jnp.sum(soft.ends), atol=1e-12)
 
 
-@pytest.mark.parametrize("gone", [(), (4, 5)], ids=str)
+@pytest.mark.parametrize("gone", [pytest.param((), marks=pytest.mark.slow), (4, 5)], ids=str)
 def test_the_merge_against_finite_differences(x64, gone):
     rng = np.random.default_rng(0)
     n = 14
