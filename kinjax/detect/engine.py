@@ -19,6 +19,7 @@ from ..lengths import BLOCK
 from ..numerics import computed_once, packed_bits
 from ..rotations import cross, normalize, rotate
 from . import noise
+from .bounds import bounds
 from .displacements import Displacement, displacements, mean_pose, spikes
 from .instantaneous import LINE, NONE, POINT, SPACE, instantaneous
 from .interface import Clip, Found, Joints, Numbers, Plan, TemplateSpans
@@ -159,15 +160,7 @@ def _thresholds(
     given: tuple[Pattern, ...],
 ) -> tuple[tuple[Pattern, ...], tuple[Array, ...], tuple[tuple[Array, Array], ...]]:
     """Step 4: pattern, template marks and thresholds of each type that has one (space first, then line and point)."""
-    least, floor, most, margin = noise.bounds(
-        plan.method == "paper",
-        (numbers.sigma_floor, numbers.eps_floor),
-        (numbers.sigma_cap, numbers.eps_cap),
-        numbers.margin,
-        numbers.rate,
-        (plan.span, plan.mean),
-        nu,
-    )
+    least, floor, most, margin = bounds(plan.method, plan.span, plan.mean, numbers, nu)
     middle = jnp.arange(valid.shape[-1], dtype=jnp.int32).astype(numbers.rate.dtype) + (
         0.5 if plan.method == "paper" else plan.span / 2
     )

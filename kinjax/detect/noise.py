@@ -184,42 +184,6 @@ def thresholds(
     return tuple(jnp.where(some, jnp.maximum(c, f), f) for c, f in zip(curves, floor, strict=True))  # type: ignore[return-value]
 
 
-class Bounds(NamedTuple):
-    """What holds thresholds in, (sigma, eps) of each object: `floor` under all of them; `least` and `cap` around what templates
-    teach (for the paper's method rounding noise and infinity), and by how much (`margin`) that is more than they show."""
-
-    least: tuple[Float[Array, " objects"], Float[Array, " objects"]]
-    floor: tuple[Float[Array, " objects"], Float[Array, " objects"]]
-    cap: tuple[Float[Array, " objects"], Float[Array, " objects"]]
-    margin: Float[Array, ""]
-
-
-def bounds(
-    paper: bool,
-    floors: tuple[Float[Array, ""], Float[Array, ""]],
-    caps: tuple[Float[Array, ""], Float[Array, ""]],
-    margin: Float[Array, ""],
-    rate: Float[Array, ""],
-    widths: tuple[int, int],
-    noise: tuple[Float[Array, " objects"], Float[Array, " objects"]],
-) -> Bounds:
-    """Bounds of the thresholds, in the units of sigma and eps: by second for the robust method, as they are for the paper's.
-
-    widths: frames, the span of a displacement and the half width of the mean of poses. noise: the data's own, metres and
-    radians; it shakes a displacement's speed by its share in the difference of two means (robust method's floor).
-    """
-    if paper:
-        low = jnp.broadcast_to(smallest_floor(rate.dtype), noise[0].shape)
-        none = jnp.full_like(low, jnp.inf)
-        floor = jnp.maximum(low, floors[0]), jnp.maximum(low, floors[1])
-        return Bounds((low, low), floor, (none, none), jnp.ones_like(margin))
-    span, half = widths
-    width = jnp.asarray(2.5 * (2 / (2 * half + 1)) ** 0.5, rate.dtype) * rate / span
-    jitter = width * noise[1], width * noise[0]
-    floor = jnp.hypot(floors[0], jitter[0]), jnp.hypot(floors[1], jitter[1])
-    return Bounds(floor, floor, (caps[0] + jitter[0], caps[1] + jitter[1]), margin)
-
-
 def no_pattern(like: Float[Array, " objects"]) -> Pattern:
     """No control points: the floor decides."""
     two, one = jnp.zeros((*like.shape, 2), like.dtype), jnp.zeros((*like.shape, 1), jnp.int32)

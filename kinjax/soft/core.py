@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..components import Parts, conjugate, matrix, vector_of_product
+from ..detect.bounds import bounds
 from ..detect.displacements import shifted, spikes
 from ..detect.interface import Clip, Joints, Numbers
-from ..detect.noise import bounds
 from ..lengths import BLOCK
 from ..numerics import safe_sqrt
 from ..rotations import dot
@@ -172,15 +172,7 @@ def thresholds(
     temperature: Float[Array, ""],
 ) -> Limits:
     """Step 4: `given`, or what the templates teach, or neither, and above the floor (smoothly: it never stops a gradient)."""
-    _, floor, cap, margin = bounds(
-        plan.method == "paper",
-        (numbers.sigma_floor, numbers.eps_floor),
-        (numbers.sigma_cap, numbers.eps_cap),
-        numbers.margin,
-        numbers.rate,
-        (plan.span, plan.mean),
-        noise,
-    )
+    _, floor, cap, margin = bounds(plan.method, plan.span, plan.mean, numbers, noise)
     if given is not None:
         bottom = [f if y.ndim == 1 else f[:, None] for f, y in zip(floor, given, strict=True)]
         return Limits(*(smooth_maximum(y, f, temperature * f) for y, f in zip(given, bottom, strict=True)))
