@@ -132,7 +132,7 @@ def _missing(detection: Detection) -> list[str]:
     """Objects that were not seen all the time, where the detection's own warnings do not name them already."""
     counts = zip(detection.objects, np.asarray(detection.missing).astype(int).tolist(), strict=True)
     known = tuple(w.split(" of ")[0] for w in detection.warnings)
-    return [f"{o}: {n} of {detection.frames} frames missing" for o, n in counts if n and f"{o}: {n}" not in known]
+    return [f"{o}: {n} of {detection.frames} frames missing, or rejected as spikes" for o, n in counts if n and f"{o}: {n}" not in known]
 
 
 def _row(c: Constraint) -> dict[str, str]:

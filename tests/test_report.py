@@ -99,7 +99,7 @@ def test_it_says_what_was_found_and_how(page):
     assert (
         "max_gap = 0.25 (default 0.1)" in text and "free_pivots = yes (default no)" in text and "stride =" not in text
     )
-    assert "8 of 240 frames missing" in text
+    assert "8 of 240 frames missing, or rejected as spikes" in text
     assert "two equally large groups" in text and "fewer than ten template intervals" in text
     raw = path.read_text(encoding="utf-8")
     body = raw.split("<h2>Constraints</h2>")[1].split("</table>")[0]
