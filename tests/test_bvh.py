@@ -343,6 +343,64 @@ def test_number_faults_are_located(word, line, column, part):
     refused(GOOD[:at] + word + GOOD[at + 8 :] + "0 0 0 0 0 0 0 0 0\n" * 3, part, line=line, column=column)
 
 
+def feet(names):
+    return [j for j, name in enumerate(names) if "foot" in name.casefold()]
+
+
+def without_arms(change=lambda row: row, frames=9) -> bytes:
+    """A figure of hips, arm and foot; `change` is made to the words of one frame: six of the hips, three of the arm, three of the
+    foot."""
+    more = "  JOINT Arm\n  {\n    OFFSET 1 1 0\n    CHANNELS 3 Zrotation Xrotation Yrotation\n  }\n"
+    head = GOOD.replace("  JOINT Foot", more + "  JOINT Foot")
+    head = head[: head.index("0.000000 90.0")].replace("Frames: 2", f"Frames: {frames}")
+    rows = [[f"{i + k / 16:.4f}" for k in range(12)] for i in range(frames)]
+    rows[frames // 2] = change(rows[frames // 2])
+    return (head + "".join(" ".join(r) + "\n" for r in rows)).encode()
+
+
+def test_only_some_joints(data):
+    """They are what they are when all are read, whatever the file's spelling; the others are NaN."""
+    for path in [*real(data), *(data / "odd_bvh" / f"{n}.bvh" for n in ("06_trailing_space", "08_exponent", "40_blank_lines"))]:
+        whole, part = read_bvh(path), read_bvh(path, joints=feet)
+        t, kept = whole.skeleton.topology, set()
+        for j in feet(t.names):
+            while j >= 0:
+                kept.add(j)
+                j = t.parents[j]
+        for j in range(whole.joints):
+            assert np.array_equal(part.rotations[:, j], whole.rotations[:, j]) or (j not in kept and np.isnan(part.rotations[:, j]).all())
+        for n, j in enumerate(t.translated):
+            a, b = part.translations[:, n], whole.translations[:, n]
+            assert np.array_equal(a, b) if j in kept else np.isnan(a).all()
+        assert (part.skeleton.topology, part.rate, part.notes[0]) == (t, whole.rate, whole.notes[0])
+
+
+def arm(*words):
+    return lambda row: [*row[:6], *words, *row[9:]]
+
+
+@pytest.mark.parametrize("ending", ["\n", " \n", "\r\n"])
+@pytest.mark.parametrize(
+    "change",
+    [arm("nan", "1", "2"), arm("1", "1,5", "2"), arm("1", "", "2"), arm("1", "x", "2"), arm("1", "--1", "2"), arm("1", "1-2", "3"),
+     arm("1", "1e", "2"), arm("1", "1e999", "2"), arm("1", "2"), arm("1", "2", "3", "4"), arm("1", "\x00", "2"), arm("1.5-2.5", "3"),
+     arm("", "1", "2"), arm("1", "2", ""), lambda row: [*row[:-1], ""], lambda row: ["", *row[1:]], lambda row: row[:6]],
+)  # fmt: skip
+def test_faults_in_joints_that_are_not_wanted(change, ending):
+    """A number that nobody wants is not converted; that it is there, and looks like one, is known nevertheless."""
+    raw = without_arms(change).replace(b"\n", ending.encode())
+    said = []
+    for joints in (None, feet):
+        with pytest.raises(FileFormatError) as e:
+            parse_bvh(raw, path="x.bvh", joints=joints)
+        said.append(str(e.value))
+    assert said[0] == said[1]
+    for good in (without_arms(), without_arms(arm("1e1", "+2", "-.5")), without_arms(arm("1", "2", "3"), frames=1)):
+        good = good.replace(b"\n", ending.encode())
+        whole, part = parse_bvh(good), parse_bvh(good, joints=feet)
+        assert np.array_equal(whole.rotations[:, 2], part.rotations[:, 2]) and np.isnan(part.rotations[:, 1]).all()
+
+
 def test_wrong_counts():
     last = GOOD.splitlines()[-1]
     refused(GOOD.replace("Frames: 2", "Frames: 3"), "27 numbers, but 18 follow, 2 frames", line=17, column=9)

@@ -27,6 +27,8 @@ FIRST = 1e4
 FLOOR = 2.0
 """Damping is at least so many rounding errors of the largest curvature."""
 
+ALIKE = 32.0
+"""Two sums of squares are the same if they differ by no more than so many rounding errors: they have thousands of terms."""
 
 LITTLE, MUCH, FASTER = 0.01, 0.75, 5.0
 """A step is taken that gains the share LITTLE of what was hoped for; the step size grows by FASTER where it gains MUCH, and
@@ -140,7 +142,7 @@ class TrustRegion(optx.AbstractSearch):
         ahead = ahead._replace(constraints=ahead.constraints + self.problem.bend(self.kinds, y, way) / 2)
         before, now = f_info.as_min(), f_eval_info.as_min()
         hoped = sum((jnp.sum(x * x) for x in ahead[1:]), jnp.sum(ahead[0] * ahead[0])) / 2 - before
-        level = FLOOR * jnp.finfo(now.dtype).eps * before
+        level = ALIKE * jnp.finfo(now.dtype).eps * before
         equal = (jnp.abs(now - before) <= level) & (jnp.abs(hoped) <= level)
         taken = ((now < before) & (now - before <= LITTLE * hoped)) | equal | first_step
         good = (now - before < MUCH * hoped) & (hoped < 0) & ~first_step

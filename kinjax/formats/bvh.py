@@ -15,7 +15,8 @@ The header is parsed in `bvh_header`, the numbers in `bvh_numbers`, the unit is 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import get_args
 
@@ -44,8 +45,9 @@ def read_bvh(path: str | Path, unit: str | float = "auto", up: Axis = "y", joint
     unit: "auto" infers it from the height of the skeleton at rest (0.5 to 3 m) and says in `Motion.notes` what it assumed;
     "m", "cm", "mm", "inch", "cmu" (inches divided by 0.45), or a number: metres in one file unit.
     up: the file's up axis ("x", "y", "z"); it is kept, nothing is turned.
-    joints: which joints are wanted, as a function from all names to indices: the whole file is read and checked, but the
-    rotations of those that are neither wanted nor above a wanted one are left out (NaN), which saves a third of the time.
+    joints: which joints are wanted, as a function from all names to indices. Rotations and translations of those that are
+    neither wanted nor above a wanted one are left out (NaN), which saves half of the time; of their numbers it is checked
+    that they are there and look like numbers.
     Returns a `Motion`: float64 translations (frames, moving, 3) in metres, rotations (frames, joints, 4) `wxyz`, `name` the
     file's name, `notes` the unit and whatever was tolerated. The rate is 1 / frame time, not rounded.
     Raises `FileFormatError` with file, line, column, what was found and the remedy.
@@ -71,7 +73,13 @@ def parse_bvh(
     width = sum(len(c) for c in topology.channels)
     if width == 0:
         fail(raw, header.frames_at, path, "no joint has a channel, so the file has no motion", "give a file with CHANNELS")
-    values, about_numbers = read_numbers(raw, header, width, path)
+    wanted = None if joints is None else _with_ancestors(joints(topology.names), topology.parents)
+    columns = _columns(topology, range(len(names)))
+    taken = None
+    if wanted is not None:
+        taken = [c + n for j, c in columns.items() if j in wanted for n in range(len(topology.channels[j]))]
+        columns = _columns(topology, sorted(wanted))
+    values, about_numbers = read_numbers(raw, header, width, path, taken)
     if len(values) * len(names) > _MOST:
         fail(raw, header.frames_at, path, f"{len(values)} frames of {len(names)} joints are too many", "split the file")
 
@@ -81,14 +89,13 @@ def parse_bvh(
     else:
         scale, unit_text = given[0], unit_note(*given, "given")
     skeleton = Skeleton(offsets * scale, ends * scale, topology)
-    translations = _translations(values, skeleton, scale)
+    translations = _translations(values, skeleton, scale, columns)
     bare = [n for n, j in zip(names, header.joints, strict=True) if j.channels is None]
     if bare:
         naming.append(f"no CHANNELS, so no motion, in {', '.join(map(repr, bare[:8]))}{' ...' if len(bare) > 8 else ''}")
     notes = [unit_text, *notes, *naming, *about_numbers, *additive_notes(skeleton, translations)]
     name = "" if path is None else clip_name(path)
-    wanted = None if joints is None else _with_ancestors(joints(topology.names), topology.parents)
-    return Motion(translations, _rotations(values, topology, wanted), skeleton, 1.0 / header.frame_time, name, tuple(notes))
+    return Motion(translations, _rotations(values, topology, columns), skeleton, 1.0 / header.frame_time, name, tuple(notes))
 
 
 def _plain(raw: bytes, path: object) -> tuple[bytes, list[str]]:
@@ -148,20 +155,23 @@ def _topology(header: Header, names: list[str], end_names: list[str], up: Axis) 
     )
 
 
-def _columns(topology: Topology) -> list[int]:
-    """The column of each joint's first channel."""
-    return np.cumsum([0, *(len(c) for c in topology.channels[:-1])]).tolist()
+def _columns(topology: Topology, joints: Sequence[int]) -> dict[int, int]:
+    """The column of each joint's first channel, where the numbers are those of these joints."""
+    return dict(zip(joints, accumulate((len(topology.channels[j]) for j in joints), initial=0), strict=False))
 
 
-def _translations(values: np.ndarray, skeleton: Skeleton, scale: float) -> np.ndarray:
+def _translations(values: np.ndarray, skeleton: Skeleton, scale: float, columns: Mapping[int, int]) -> np.ndarray:
+    """Local translations (frames, moving, 3) in metres; NaN for a joint that has no column."""
     topology = skeleton.topology
     out = np.empty((len(values), len(topology.translated), 3))
     out[...] = np.asarray(skeleton.offsets)[list(topology.translated)]
-    column = _columns(topology)
     for n, j in enumerate(topology.translated):
+        if j not in columns:
+            out[:, n] = np.nan
+            continue
         for c, channel in enumerate(topology.channels[j]):
             if channel.endswith("position"):
-                out[:, n, "XYZ".index(channel[0])] = values[:, column[j] + c] * scale
+                out[:, n, "XYZ".index(channel[0])] = values[:, columns[j] + c] * scale
     return out
 
 
@@ -174,18 +184,16 @@ def _with_ancestors(joints: Iterable[int], parents: tuple[int, ...]) -> set[int]
     return found
 
 
-def _rotations(values: np.ndarray, topology: Topology, wanted: set[int] | None = None) -> np.ndarray:
-    """Local rotations (frames, joints, 4), in memory one row of frames a component; few joints of short clips are done together."""
+def _rotations(values: np.ndarray, topology: Topology, columns: Mapping[int, int]) -> np.ndarray:
+    """Local rotations (frames, joints, 4), NaN for a joint that has no column; in memory one row of frames a component. Few
+    joints of short clips are done together."""
     groups: dict[str, list[tuple[int, list[int]]]] = {}
-    for j, (channels, first) in enumerate(zip(topology.channels, _columns(topology), strict=True)):
-        if wanted is not None and j not in wanted:
-            continue
-        turns = [(c[0].lower(), first + n) for n, c in enumerate(channels) if c.endswith("rotation")]
+    for j, first in columns.items():
+        turns = [(c[0].lower(), first + n) for n, c in enumerate(topology.channels[j]) if c.endswith("rotation")]
         groups.setdefault("".join(axis for axis, _ in turns), []).append((j, [column for _, column in turns]))
     frames = len(values)
     out = np.empty((len(topology.names), 4, frames))
-    if wanted is not None:
-        out[[j for j in range(len(out)) if j not in wanted]] = np.nan
+    out[[j for j in range(len(out)) if j not in columns]] = np.nan
     rows, some = values.T, max(1, _BLOCK // max(frames, 1))
     for axes, members in groups.items():
         for at in range(0, len(members), some):

@@ -8,11 +8,15 @@ exporters count the intervals. One frame less is a file cut short, and refused.
 Fastest, for files with one frame a line and single spaces: pyarrow's CSV reader takes the lines as rows. Else white space
 becomes line ends, and it parses one column in parallel blocks, skipping empty lines. It refuses what is no number, but lets
 NaN and infinities through. Nothing is allocated from the declared size.
+
+Where only some channels are wanted, the fastest way converts only these; of the others it is known that each line has one
+word for each of them, made of digits and points, perhaps with a minus before (`1.2.3` is refused only where it is converted).
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from itertools import islice
 
 import numpy as np
@@ -27,11 +31,14 @@ _WIDE = 2048  # channels: more columns than that are slower than one
 _PIECE = 1 << 17  # bytes at a time: the masks of a piece stay in the cache
 
 
-def read_numbers(raw: bytes, header: Header, channels: int, path: object = None) -> tuple[np.ndarray, list[str]]:
-    """The numbers as (frames, channels), and notes on what was tolerated. `FileFormatError` as the module says."""
+def read_numbers(
+    raw: bytes, header: Header, channels: int, path: object = None, wanted: Sequence[int] | None = None
+) -> tuple[np.ndarray, list[str]]:
+    """The numbers as (frames, channels), or (frames, wanted) where only some channels are; and notes on what was tolerated.
+    `FileFormatError` as the module says."""
     at = header.data_at
     if raw.find(b"#", at) < 0 and raw.find(b"/", at) < 0:
-        found = _parse_rows(raw, at, channels)
+        found = _parse_rows(raw, at, channels, wanted)
         if found is not None and found.shape[1] in (header.frames, header.frames + 1) and np.isfinite(found).all():
             more = [_one_more(header)] if found.shape[1] > header.frames else []
             return found.T, more + ([] if raw[-1:].isspace() else _last_number(raw, raw[at:], header, channels, path))
@@ -63,24 +70,29 @@ def read_numbers(raw: bytes, header: Header, channels: int, path: object = None)
             _ragged(raw, block, header, channels, lines, path)
         notes.append(f"the {frames} frames stand on {len(rows)} lines")
     notes += _last_number(raw, block, header, channels, path)
-    return values.reshape(frames, channels), notes
+    values = values.reshape(frames, channels)
+    return values if wanted is None else values[:, list(wanted)], notes
 
 
 def _one_more(header: Header) -> str:
     return f"'Frames:' says {header.frames}, but {header.frames + 1} follow: all were read"
 
 
-def _parse_rows(raw: bytes, at: int, channels: int) -> np.ndarray | None:
-    """(channels, frames), one row of memory a channel, if every line is a frame with one space between numbers, as most files
-    are written; else None, and the slower way finds out. A line with a number too few or too many is refused by the parser."""
+def _parse_rows(raw: bytes, at: int, channels: int, wanted: Sequence[int] | None) -> np.ndarray | None:
+    """(channels, frames), one row of memory a channel (or a wanted one), if every line is a frame with one space between
+    numbers, as most files are written; else None, and the slower way finds out. A line with a number too few or too many is
+    refused by the parser."""
     import pyarrow as pa
     from pyarrow import csv
 
-    if channels > _WIDE:
+    if channels > _WIDE or (wanted is not None and not wanted):
         return None
     names = [str(i) for i in range(channels)]
     first = raw[at : at + (1 << 16)].lstrip(b"\n").partition(b"\n")[0]
     behind = ["behind"] if first.endswith(b" ") else []  # a space after the last number: an empty column
+    if wanted is not None and not _plain_words(raw, at, bool(behind)):
+        return None
+    taken = names if wanted is None else [names[i] for i in wanted]
     try:
         table = csv.read_csv(
             pa.py_buffer(memoryview(raw)[at:]),
@@ -88,6 +100,7 @@ def _parse_rows(raw: bytes, at: int, channels: int) -> np.ndarray | None:
             parse_options=csv.ParseOptions(delimiter=" ", quote_char=False, ignore_empty_lines=True),
             convert_options=csv.ConvertOptions(
                 column_types=dict.fromkeys(names, pa.float64()) | dict.fromkeys(behind, pa.string()),
+                include_columns=[*taken, *behind],
                 null_values=[],
                 strings_can_be_null=False,
             ),
@@ -96,13 +109,30 @@ def _parse_rows(raw: bytes, at: int, channels: int) -> np.ndarray | None:
         return None
     if behind and any(x != "" for x in table["behind"].unique().to_pylist()):
         return None
-    out = np.empty((channels, table.num_rows))
-    for row, column in zip(out, table.columns[:channels], strict=True):
+    out = np.empty((len(taken), table.num_rows))
+    for row, column in zip(out, table.columns[: len(taken)], strict=True):
         begin = 0
         for chunk in column.chunks:
             row[begin : begin + len(chunk)] = chunk.to_numpy()
             begin += len(chunk)
     return out
+
+
+def _plain_words(raw: bytes, at: int, behind: bool) -> bool:
+    """Is the block made of digits, points, minus signs that begin a word, and single spaces or line ends between words (`behind`: and
+    a space at the end of lines)? Then no word of it is empty, NaN, text or a number with a decimal comma."""
+    if raw[-1:] == b" " and not behind:
+        return False
+    text = np.frombuffer(raw, np.uint8, offset=at)
+    for begin in range(0, len(text), _PIECE):
+        piece = text[begin : begin + _PIECE + 1]  # the first of the next one, too: pairs are looked at
+        gap, end, minus = piece == 32, piece == 10, piece == 45
+        blank = gap | end
+        if ((piece - np.uint8(45)) > 12).tobytes() != blank.tobytes():  # others than - . and digits; the slash is not there
+            return False
+        if (blank[:-1] & gap[1:]).any() or (minus[1:] > blank[:-1]).any() or (not behind and (gap[:-1] & end[1:]).any()):
+            return False
+    return True
 
 
 def _parse(block: bytes) -> np.ndarray | None:
