@@ -198,8 +198,8 @@ def _rotations(values: np.ndarray, topology: Topology, columns: Mapping[int, int
     for axes, members in groups.items():
         for at in range(0, len(members), some):
             block = members[at : at + some]
-            columns = np.array([c for _, c in block], int)
-            parts = quaternion_parts(rows[columns.T] if len(block) > 1 else rows[columns[0]][:, None], axes)
+            at_rows = np.array([c for _, c in block], int)
+            parts = quaternion_parts(rows[at_rows.T] if len(block) > 1 else rows[at_rows[0]][:, None], axes)
             for component, part in enumerate(parts):
                 out[[j for j, _ in block], component] = part
     return out.transpose(2, 0, 1)
