@@ -56,23 +56,22 @@ def run_job(folder: Path, store: Path, options: argparse.Namespace, cache: Path)
 def speed(options: argparse.Namespace, top: Path) -> None:
     """Rates of the job, of parsing, and of the peer; memory; what was refused."""
     folder, store = top / "clips", top / "store"
-    bad, total = make_folder(folder, options.clips, options.pool, longest=options.longest)
-    files = sorted(str(p) for p in folder.glob("[0-9]*/*.bvh"))
-    print(f"{len(files):,} files, {bad} of them broken, {total / 1e6:,.0f} MB, 60 to {options.longest:,} frames")
+    sound, total = make_folder(folder, options.clips, options.pool, longest=options.longest)
+    bad = options.clips - len(sound)
+    print(f"{options.clips:,} files, {bad} of them broken, {total / 1e6:,.0f} MB, 60 to {options.longest:,} frames", flush=True)
     cache = top / "programs"
-    good = [f for f in files if Path(f).stat().st_size > 20000 and "broken" not in f]
     if options.warm:
         shutil.rmtree(store, ignore_errors=True)
         run_job(folder, store, options, cache)
         shutil.rmtree(store)
-    sample = good[: max(1, min(len(good), options.sample))]
+    sample = [str(p) for p in sound[: options.sample]]
     before, size = timed(parse_blocks, sample, options.workers)
     seconds, curve = run_job(folder, store, options, cache)
     after, _ = timed(parse_blocks, sample, options.workers)
     parse = 2 * size / (before + after) / 1e6
     job = total / seconds / 1e6
     programs = len(list(cache.glob("*run_clips*-cache"))) if cache.is_dir() else 0
-    print(f"job, read to store: {seconds:.1f} s, {len(files) / seconds:.1f} clips/s, {job:.1f} MB/s; compiled {programs} programs")
+    print(f"job, read to store: {seconds:.1f} s, {options.clips / seconds:.1f} clips/s, {job:.1f} MB/s; compiled {programs} programs")
     print(f"number blocks alone, {options.workers} processes: {parse:.1f} MB/s; the job runs at {job / parse:.2f} of that")
     if curve:
         third = len(curve) // 3

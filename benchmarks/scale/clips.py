@@ -47,8 +47,8 @@ def walk(frames: int, seed: int) -> Motion:
     return noisy_motion(long, 0.001, seed)
 
 
-def make_folder(folder: Path, count: int, pool: int, seed: int = 0, longest: int = LONGEST) -> tuple[int, int]:
-    """`count` files in folders of 500; how many are broken, and the bytes of all (links counted)."""
+def make_folder(folder: Path, count: int, pool: int, seed: int = 0, longest: int = LONGEST) -> tuple[list[Path], int]:
+    """`count` files in folders of 500; those that are not broken, and the bytes of all (links counted)."""
     rng = np.random.default_rng(seed)
     lengths = np.exp(rng.uniform(np.log(SHORTEST), np.log(longest), pool)).astype(int)
     source = folder / ".pool"
@@ -60,13 +60,14 @@ def make_folder(folder: Path, count: int, pool: int, seed: int = 0, longest: int
         if i < 20:
             bad.append(source / f"broken-{i}.bvh")
             bad[-1].write_bytes(broken(path.read_bytes(), i))
-    broken_ones, total = 0, 0
+    sound, total = [], 0
     for i in range(count):
         is_broken = rng.random() < BROKEN_SHARE
         original = bad[i % len(bad)] if is_broken else good[i % len(good)]
         target = folder / f"{i // 500:03d}" / f"{i % 97:02d}_{i:05d}.bvh"
         target.parent.mkdir(exist_ok=True)
         os.link(original, target)
-        broken_ones += is_broken
         total += original.stat().st_size
-    return broken_ones, total
+        if not is_broken:
+            sound.append(target)
+    return sound, total
