@@ -37,14 +37,14 @@ def memory_of(process: subprocess.Popen[str]) -> list[int]:
         return []
 
 
-def run_job(folder: Path, store: Path, options: argparse.Namespace, cache: Path) -> tuple[float, list[tuple[float, int]]]:
-    """Seconds of the job, and over time (share of its clips done, MiB of its largest process)."""
+def run_job(folder: Path, store: Path, options: argparse.Namespace, cache: Path) -> tuple[float, list[int]]:
+    """Seconds of the job, and the MiB of its largest process, every second."""
     env = {**os.environ, "KINJAX_CACHE": str(cache)}
     start, curve = time.perf_counter(), []
     process = subprocess.Popen(command(folder, store, options), env=env, stdout=subprocess.PIPE, text=True)
     while process.poll() is None:
-        time.sleep(0.5)
-        curve.append((time.perf_counter() - start, next(iter(memory_of(process)), 0)))
+        time.sleep(1.0)
+        curve.append(next(iter(memory_of(process)), 0))
     told = process.stdout.read() if process.stdout else ""
     seconds = time.perf_counter() - start
     if process.returncode not in (0, 3):
@@ -73,9 +73,10 @@ def speed(options: argparse.Namespace, top: Path) -> None:
     programs = len(list(cache.glob("*run_clips*-cache"))) if cache.is_dir() else 0
     print(f"job, read to store: {seconds:.1f} s, {options.clips / seconds:.1f} clips/s, {job:.1f} MB/s; compiled {programs} programs")
     print(f"number blocks alone, {options.workers} processes: {parse:.1f} MB/s; the job runs at {job / parse:.2f} of that")
-    if curve:
+    if len(curve) > 10:
         third = len(curve) // 3
-        print(f"memory of the largest process: {curve[third][1]} MiB after a third, {curve[-2][1]} MiB at the end")
+        parts = [max(curve[i * third : (i + 1) * third]) for i in range(3)]
+        print(f"largest memory of a process: {parts[0]}, {parts[1]}, {parts[2]} MiB in the three thirds of the time")
     try:
         few = sample[: max(options.workers, min(len(sample), 40))]
         took, read = timed(toe_speed_script, few, options.workers)
