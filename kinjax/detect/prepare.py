@@ -25,6 +25,8 @@ from .settings import Settings
 Padded = Callable[[int], int]
 """From a number of frames to the length of the arrays: `lengths.bucket` or `lengths.octave`."""
 
+_PIECE = 512  # frames
+
 
 @dataclass(frozen=True)
 class Prepared:
@@ -184,6 +186,29 @@ def used_joints(motion: Motion, objects: Sequence[int]) -> tuple[tuple[int, ...]
     return tuple(sorted(needed)), tuple(k for k, j in enumerate(top.translated) if j in needed)
 
 
+def _frames_last(q: np.ndarray, joints: Sequence[int], room: int, length: int, dtype: np.dtype) -> np.ndarray:
+    """Rotations (frames, all, 4) of some joints as (room, 4, length), filled up with the identity."""
+    frames, count = len(q), len(joints)
+    out = np.empty((room, 4, length), dtype)
+    out[:, :, frames:] = out[count:] = np.eye(4)[0][:, None]
+    if q.strides[0] == q.itemsize:  # as the readers leave it: each row is copied whole
+        for i, j in enumerate(joints):
+            out[i, :, :frames] = q[:, j].T
+        return out
+    some = slice(None) if count == q.shape[1] else list(joints)
+    for begin in range(0, frames, _PIECE):  # what is turned round stays in the cache
+        piece = q[begin : begin + _PIECE, some].astype(dtype)
+        out[:count, :, begin : begin + len(piece)] = piece.transpose(1, 2, 0)
+    return out
+
+
+def _all_finite(x: np.ndarray) -> bool:
+    """Is every number finite? Where their squares can be added up, they are; only where not, each is looked at."""
+    flat = x.reshape(-1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool(np.isfinite(np.dot(flat, flat))) or bool(np.isfinite(x).all())
+
+
 def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool, padded: Padded) -> Prepared:
     """A motion as the engine takes it: only the objects and their ancestors, so that one hand costs one arm."""
     check_rate(float(motion.rate))
@@ -197,14 +222,10 @@ def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool, 
     moving = [top.translated[k] for k in rows]
     dtype, frames = working_dtype(), motion.frames
     length, room = padded(frames + BLOCK), 8 * -(-len(joints) // 8)
-    q, t = np.moveaxis(np.asarray(motion.rotations), 0, -1), np.asarray(motion.translations)
-    t = np.asarray(t[:, list(rows)], float)
+    t = np.asarray(np.asarray(motion.translations)[:, list(rows)], float)
     valid: Any = np.ones(frames, bool)
-    rotations = np.zeros((room, 4, length), dtype)
-    for i, j in enumerate(joints):
-        rotations[i, :, :frames] = q[j]
-    rotations[:, 0, frames:] = rotations[len(joints) :, 0] = 1
-    if not (np.isfinite(rotations).all() and np.isfinite(t).all()):  # frame by frame takes three times as long
+    rotations = _frames_last(np.asarray(motion.rotations), joints, room, length, dtype)
+    if not (_all_finite(rotations) and np.isfinite(t).all()):  # frame by frame takes three times as long
         valid = np.isfinite(rotations[..., :frames]).all((0, 1)) & np.isfinite(t).all((1, 2))
     root = np.array([top.parents[j] < 0 for j in moving])
     origin = t[np.argmax(valid), int(np.argmax(root))] if near and valid.any() and root.any() else np.zeros(3)
