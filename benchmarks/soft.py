@@ -1,7 +1,8 @@
 """`python -m benchmarks.soft`: soft detection with its gradient against hard detection, as ratios in one process on one core.
 
 `--distance` prints how far soft labels are from hard ones as the temperature falls. The clip and the way of timing are those of
-`benchmarks.speed`; the gradient is that of a label loss with respect to all joint rotations and the thresholds of all objects.
+`benchmarks.speed`, with `kinjax.keep_memory()`; the gradient is that of a label loss with respect to all joint rotations and the
+thresholds of all objects.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ def speed() -> None:
     import jax.numpy as jnp
     import numpy as np
 
-    from kinjax import soft
+    from kinjax import keep_memory, soft
     from kinjax.detect import detect
 
+    keep_memory()
     motion = walking_crowd()
     rotations = jnp.asarray(motion.rotations, jnp.float32)
     for method, options, width in (

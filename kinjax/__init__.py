@@ -39,6 +39,7 @@ _ROOMS = {
     "formats": ("load", "save", "read_bvh", "write_bvh", "read_annotations", "write_annotations", "read_edit"),
     "database": ("Configuration", "Store", "TemplateRule", "When", "annotate"),
     "evaluation": ("Label", "evaluate"),
+    "memory": ("keep_memory",),
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 

@@ -79,8 +79,8 @@ def order_statistic(
     def refine(i: Int[Array, ""], low: Int[Array, "..."]) -> Int[Array, "..."]:
         trial = low | (jnp.ones((), integer) << (jnp.asarray(bits - 2, integer) - i.astype(integer)))
         # XLA does not vectorise a reduction to a count: slices are added up element by element, what is left is short
-        signs = functools.reduce(jnp.add, ((part - trial[..., None]) >> jnp.asarray(bits - 1, integer) for part in slices))
-        below = -jnp.sum(signs, axis=-1, dtype=jnp.int32)
+        counts = functools.reduce(jnp.add, ((part < trial[..., None]).astype(jnp.int32) for part in slices))
+        below = jnp.sum(counts, axis=-1, dtype=jnp.int32)
         return jnp.where(below <= rank, trial, low)
 
     found = jax.lax.fori_loop(0, bits - 1, refine, jnp.zeros(x.shape[:-1], integer))

@@ -20,6 +20,7 @@ from ..database.job import Progress, Report, annotate
 from ..database.work import JobFailed
 from ..errors import KinjaxError, OptionError
 from ..formats import motion_suffixes
+from ..memory import keep_memory
 from .assignments import changed_settings
 from .cache import cache_folder
 from .database_options import Annotate
@@ -36,6 +37,7 @@ def annotate_command(options: Annotate) -> int:
     if options.output is None:
         raise OptionError("-o STORE says where the annotations go")
     configuration = _configuration(options)
+    keep_memory()
     engine = make_engine(options.engine, options.workers, options.scheduler, options.threads, options.patience)
     screen = Screen(options.quiet)
     began = time.monotonic()

@@ -15,9 +15,12 @@ FAST_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshol
 
 
 def use_cache() -> Path | None:
-    """Keep compiled programs in `cache_folder()`; gives the directory, or None where there is none."""
+    """Keep compiled programs in `cache_folder()`, and memory; gives the directory, or None where there is none."""
     import jax
 
+    from ..memory import keep_memory
+
+    keep_memory()
     told = jax.config.values["jax_compilation_cache_dir"]
     if told and not os.environ.get("KINJAX_CACHE", ""):
         return Path(told)

@@ -14,9 +14,10 @@ from queue import Empty, SimpleQueue
 from typing import Any, Protocol
 
 from ..errors import OptionError
+from ..memory import OPTIONS
 from .work import JobFailed, Receipt, Task, annotate_part, one_thread
 
-KEEP_MEMORY = {"MALLOC_TRIM_THRESHOLD_": "1000000000", "MALLOC_MMAP_THRESHOLD_": "1000000000"}
+KEEP_MEMORY = {f"MALLOC_{name}_": str(size) for name, (_, size) in OPTIONS.items()}
 """A clip's arrays have the size of the last one's: memory that goes back to the system in between costs a fault a page (Dask gives
 all of it back by default)."""
 

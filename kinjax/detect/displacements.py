@@ -13,11 +13,12 @@ from __future__ import annotations
 import functools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..numerics import computed_once, over_rows
-from ..rotations import conjugate, dot, matrix, multiply, normalize
+from ..rotations import conjugate, matrix, multiply, normalize
 
 
 class Displacement(NamedTuple):
@@ -57,23 +58,28 @@ def mean_pose(
     t: Float[Array, "3 objects frames"],
     valid: Bool[Array, "objects frames"],
     h: int,
+    never: Bool[Array, ""] | None = None,
 ) -> tuple[Float[Array, "4 objects frames"], Float[Array, "3 objects frames"]]:
     """Mean pose over the valid ones of `2h + 1` frames around each frame (fewer at the clip's ends).
 
     Rotations: sum of quaternions turned to the centre's half-sphere, normalised: the chordal mean for the small angles of
-    40 ms. Invalid centres stay as they are.
+    40 ms. Invalid centres stay as they are. `never`: as `computed_once` has it, for speed; without it there is a gradient.
     """
-    qs, ts, n = jnp.zeros_like(q), jnp.zeros_like(t), jnp.zeros_like(t[0])
-    for s in range(-h, h + 1):
-        here = shifted(valid, s, False)
-        other = shifted(q, s)
-        sign = jnp.where(dot(other, q) < 0, -jnp.ones_like(n), jnp.ones_like(n))
-        weight = here.astype(q.dtype)
-        qs = qs + weight * sign * other
-        ts = ts + weight * (shifted(t, s) - t)  # differences: exact far from the origin
-        n = n + weight
-    n = jnp.maximum(n, 1)
-    return jnp.where(valid, normalize(qs), q), jnp.where(valid, t + ts / n, t)
+    frames, shifts = valid.shape[-1], range(2 * h + 1)
+    # padded once and by component: what is around a frame is then slices of one array, which vectorise
+    wide = [jnp.pad(x, [(0, 0), (h, h)]) for x in (valid.astype(t.dtype), *q, *t)]
+    wide = wide if never is None else computed_once(wide, never)
+    around = [[x[..., s : s + frames] for s in shifts] for x in wide]
+    seen, qs, ts = around[0], around[1:5], around[5:]
+    centers = [x[h] for x in qs], [x[h] for x in ts]
+    same = [sum(x[s] * c for x, c in zip(qs, centers[0], strict=True)) for s in shifts]
+    weights = [jnp.where(d < 0, -w, w) for d, w in zip(same, seen, strict=True)]
+    count = jnp.maximum(sum(seen), 1)
+    turned = [sum(w * y for w, y in zip(weights, x, strict=True)) for x in qs]
+    moved = [sum(w * (y - c) for w, y in zip(seen, x, strict=True)) for x, c in zip(ts, centers[1], strict=True)]
+    q_mean = [jnp.where(valid, x, c) for x, c in zip(normalize(jnp.stack(turned)), centers[0], strict=True)]
+    t_mean = [jnp.where(valid, c + x / count, c) for x, c in zip(moved, centers[1], strict=True)]  # exact far from the origin
+    return jnp.stack(q_mean), jnp.stack(t_mean)
 
 
 def spikes(
@@ -91,10 +97,13 @@ def spikes(
     """
     lever = jnp.asarray(0.1, t.dtype)
     r = matrix(q)
-    coordinates = jnp.concatenate([t, *(t + lever * r[:, k] for k in range(3))])
     frames, big = valid.shape[-1], jnp.asarray(jnp.finfo(t.dtype).max, t.dtype)
-    # what is missing is the largest number, also beyond the ends: a window is then slices of one array, which vectorise
-    rows = jnp.pad(jnp.where(valid, coordinates, big), [(0, 0), (0, 0), (half, half)], constant_values=big)
+    # what is missing is the largest number, also beyond the ends: a window is then slices of one array, which vectorise. Each
+    # coordinate is written where it belongs: what computes inside a concatenation does not vectorise
+    rows = jnp.full((12, valid.shape[0], frames + 2 * half), big)
+    for k in range(12):
+        x = t[k % 3] if k < 3 else t[k % 3] + lever * r[k % 3, k // 3 - 1]
+        rows = jax.lax.dynamic_update_slice(rows, jnp.where(valid, x, big)[None], (k, 0, half))
     around = jnp.pad(valid.astype(jnp.int32), [(0, 0), (half, half)])
     around, rows = computed_once((around, rows), never)
     count = sum(around[:, s : s + frames] for s in range(2 * half + 1))

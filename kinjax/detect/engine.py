@@ -45,10 +45,11 @@ def run(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, give
     never = numbers.rate < 0
     turned, moved, seen = computed_once((turned, moved, seen), never)
     q, t = jnp.stack(turned), jnp.stack(moved)
-    valid = seen if paper else seen & ~spikes(q, t, seen, plan.hampel, numbers.spike, never)
+    valid = seen if paper else computed_once(seen & ~spikes(q, t, seen, plan.hampel, numbers.spike, never), never)
     clip = Clip(q, t, valid)
-    smooth = clip if paper else Clip(*mean_pose(q, t, valid, plan.mean), valid)
-    nu = (jnp.zeros_like(t[0, :, 0]),) * 2 if paper else noise.data_noise(q, t, valid)
+    smooth = clip if paper else Clip(*mean_pose(q, t, valid, plan.mean, never), valid)
+    real = t.shape[-1] - BLOCK + 3  # without padding, and three frames more: as many third differences as there are in whole blocks
+    nu = (jnp.zeros_like(t[0, :, 0]),) * 2 if paper else noise.data_noise(*(x[..., :real] for x in (q, t, valid)))
     x = displacements(*smooth, plan.span)
     if paper and plan.span > 1:  # interval i belongs to frames i and i + 1, however far the displacement reaches
         x = x._replace(valid=x.valid & valid[:, 1 : 1 - plan.span])
@@ -72,14 +73,9 @@ def run(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, give
     else:
         total, spans = _merge(plan, numbers, passed, x.valid, points, smooth)
     if not paper:
-        spans = settle(
-            spans,
-            Poses(*clip),
-            Poses(*smooth),
-            nu,
-            0 if plan.method == "window" else plan.span,
-            plan.mean + (plan.span + 1) // 2,
-        )
+        wide = 0 if plan.method == "window" else plan.span
+        settled = settle(spans, Poses(*clip), Poses(*smooth), nu, wide, plan.mean + (plan.span + 1) // 2)
+        spans = computed_once(settled, never)
     found, overflow = _refit(plan, numbers, spans, clip), total
     pivot_noise = jnp.maximum(numbers.pivot_noise, jnp.maximum(numbers.pivot_floor, nu[0]))
     if plan.lines and not paper:
@@ -234,7 +230,7 @@ def _rest_windows(
     nothing = jnp.zeros_like(clip.valid)
     windows = best_segmentation(window_rewards(*clip, nothing, *plan.rest, reward, rest=True), plan.rest[0])
     kind = jnp.where(windows.inside, SPACE, NONE)
-    smooth = mean_pose(*clip, plan.mean)[1]
+    smooth = mean_pose(*clip, plan.mean, numbers.rate < 0)[1]
     find, total = elements(
         kind,
         (packed_bits(windows.is_first), packed_bits(windows.is_last)),

@@ -15,7 +15,6 @@ from jaxtyping import Array, Bool, Float, Int
 from ..numerics import order_statistic, over_rows, safe_divide, safe_sqrt
 from ..rotations import matrix
 from ..splines import monotone_cubic, natural_cubic
-from .displacements import shifted
 from .lmeds import lmeds, naive
 from .sigma_epsilon import FLOOR_EPS
 
@@ -52,11 +51,13 @@ def data_noise(
     Median absolute ones, so that contacts and spikes do not count. Summed over 3 position components, or over the 9 of the
     rotation matrix, whose Frobenius norm is `sqrt(2)` times the angle. 0 with fewer than four frames.
     """
-    four = valid & shifted(valid, 1, False) & shifted(valid, 2, False) & shifted(valid, 3, False)
+    n = max(valid.shape[-1] - 3, 0)
+    at = lambda x, k: x[..., k : k + n]  # noqa: E731  (slices of one array vectorise)
+    four = at(valid, 0) & at(valid, 1) & at(valid, 2) & at(valid, 3)
     rank = (jnp.sum(four, axis=-1, dtype=jnp.int32) - 1) // 2
 
     def variance(x: Float[Array, "*rows objects frames"]) -> Float[Array, "*rows objects"]:
-        third = shifted(x, 3) - 3 * shifted(x, 2) + 3 * shifted(x, 1) - x
+        third = at(x, 3) - 3 * at(x, 2) + 3 * at(x, 1) - at(x, 0)
         median = order_statistic(jnp.abs(third), four, jnp.maximum(rank, 0))
         return jnp.where(rank >= 0, (jnp.asarray(1.4826, x.dtype) * jnp.nan_to_num(median)) ** 2 / 20, 0)
 
