@@ -86,7 +86,7 @@ slope = jax.jit(jax.value_and_grad(loss, has_aux=True))
 # %%
 curve = jnp.zeros((len(knots), 2, 3))
 mean, square, history = jnp.zeros_like(curve), jnp.zeros_like(curve), []
-STEPS = 120
+STEPS = 80
 for i in range(1, STEPS + 1):
     (value, (planted, agree, out)), g = slope(curve)
     history.append((float(planted) ** 0.5, float(agree)))

@@ -232,6 +232,7 @@ def test_settings_are_hashable_and_checked():
     assert hash(Settings()) == hash(Settings()) and Settings().but(types=("LINE",)).types == ("line",)
 
 
+@pytest.mark.slow
 def test_line_templates_teach_the_noise_of_pivots(foot):
     noisy = synthetic.with_noise(foot, 0.003, 2).poses
     toe = foot.truth.of("foot", "line")[1]
