@@ -94,7 +94,8 @@ def test_more_frames_than_motions_are_columns(plots, walk):
     figure = plots.side_by_side({"walk": walk}, [5, 15, 25])
     left = [a.get_position().x0 for a in figure.axes]
     below = [a.get_position().y0 for a in figure.axes]
-    assert sorted(set(left)) == left and len(set(below)) == 1 and figure.get_figwidth() > figure.get_figheight()
+    assert (np.diff(left) > 0.1).all() and np.ptp(below) < 1e-9  # shares of the figure, to rounding
+    assert figure.get_figwidth() > figure.get_figheight()
     drawn(figure)
 
 
