@@ -89,6 +89,16 @@ def order_statistic(
     return jnp.where(enough, value, jnp.full_like(value, jnp.nan))
 
 
+def shifted(x: Array, s: int, fill: float | bool = 0) -> Array:
+    """`y[..., i] = x[..., i + s]`, `fill` where that is outside."""
+    if s == 0:
+        return x
+    n = x.shape[-1]
+    s = max(-n, min(n, s))
+    pad = jnp.full((*x.shape[:-1], abs(s)), fill, x.dtype)
+    return jnp.concatenate([x[..., s:], pad] if s > 0 else [pad, x[..., :s]], axis=-1)
+
+
 def _blocks(x: Float[Array, "... n"]) -> tuple[Float[Array, "... blocks size"], Float[Array, "... blocks"]]:
     """Inclusive running sums inside blocks, and the sum before each block: a product with a triangle of ones, and a short
     scan over blocks (XLA's own cumulative sum takes a pass for every power of two)."""

@@ -43,16 +43,6 @@ def displacements(
     return Displacement(r[1:], r[0], d, valid[..., :-k] & valid[..., k:])
 
 
-def shifted(x: Array, s: int, fill: float | bool = 0) -> Array:
-    """`y[..., i] = x[..., i + s]`, `fill` where that is outside."""
-    if s == 0:
-        return x
-    n = x.shape[-1]
-    s = max(-n, min(n, s))
-    pad = jnp.full((*x.shape[:-1], abs(s)), fill, x.dtype)
-    return jnp.concatenate([x[..., s:], pad] if s > 0 else [pad, x[..., :s]], axis=-1)
-
-
 def mean_pose(
     q: Float[Array, "4 objects frames"],
     t: Float[Array, "3 objects frames"],

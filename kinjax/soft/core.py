@@ -17,10 +17,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..components import Parts, conjugate, matrix, vector_of_product
 from ..detect.bounds import bounds
-from ..detect.displacements import shifted, spikes
+from ..detect.displacements import spikes
 from ..detect.interface import Clip, Joints, Numbers
 from ..lengths import BLOCK
-from ..numerics import safe_sqrt
+from ..numerics import safe_sqrt, shifted
 from ..rotations import dot
 from .body import joint_poses
 from .instantaneous import Limits, soft_instantaneous

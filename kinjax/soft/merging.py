@@ -20,8 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..components import Parts
-from ..detect.displacements import shifted
-from ..numerics import running_count
+from ..numerics import running_count, shifted
 from ..rotations import dot
 from .steps import within
 

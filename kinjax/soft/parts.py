@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from ..components import Parts
-from ..detect.displacements import shifted
+from ..numerics import shifted
 from ..rotations import dot
 
 

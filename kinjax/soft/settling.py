@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..components import Parts, conjugate, vector_of_product
-from ..detect.displacements import shifted
 from ..detect.settling import PLACE
+from ..numerics import shifted
 from ..rotations import dot
 from .steps import within
 
