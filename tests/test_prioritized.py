@@ -127,14 +127,13 @@ def test_budget_is_spent_in_order_and_clamps_hold():
     j = jnp.asarray(rng.normal(size=(9, N)), jnp.float32)
     layer = jnp.asarray(LAYER[:9])
     f = factorize(j, layer, jnp.zeros(9))
-    block = jnp.kron(jnp.eye(3), jnp.ones((3, 3)))
     dx = jnp.asarray(rng.normal(size=9), jnp.float32)
-    free = layered_step(f, dx, layer, 3, block, jnp.inf, jnp.inf)
+    free = layered_step(f, dx, layer, 3, 3, jnp.inf, jnp.inf)
     first = float(jnp.linalg.norm(free[:3]))
-    tight = layered_step(f, dx, layer, 3, block, jnp.inf, 1.1 * first)
+    tight = layered_step(f, dx, layer, 3, 3, jnp.inf, 1.1 * first)
     np.testing.assert_array_equal(tight[:3], free[:3])  # the first layer has its step
     assert np.isclose(float(jnp.linalg.norm(tight)), 1.1 * first, rtol=1e-5)
-    short = layered_step(f, dx, layer, 3, block, 1e-3, jnp.inf)
+    short = layered_step(f, dx, layer, 3, 3, 1e-3, jnp.inf)
     moved = f.basis.factors @ short
     for k in range(3):
         asked = moved[3 * k : 3 * k + 3]
@@ -157,8 +156,7 @@ def test_drag_spares_what_is_not_singular(scale, x64):
     held = factorize(j, jnp.zeros(3, jnp.int32), jnp.zeros(3), (strong, 0.1), travel)
     free = factorize(j, jnp.zeros(3, jnp.int32), jnp.zeros(3))
     dx = scale * jnp.asarray([1.0, 1.0, 1e-3])
-    block = jnp.ones((3, 3))
-    y = layered_step(held, dx, jnp.zeros(3, jnp.int32), 1, block, jnp.inf, jnp.inf, drag=True)
-    f = layered_step(free, dx, jnp.zeros(3, jnp.int32), 1, block, jnp.inf, jnp.inf)
+    y = layered_step(held, dx, jnp.zeros(3, jnp.int32), 1, 3, jnp.inf, jnp.inf, drag=True)
+    f = layered_step(free, dx, jnp.zeros(3, jnp.int32), 1, 3, jnp.inf, jnp.inf)
     np.testing.assert_allclose(y[:2], f[:2], rtol=1e-6)
     assert abs(float(y[2])) < 1e-4 * abs(float(f[2]))

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..rotations import exp, log, matrix, normalize
+from ..rotations import exp, log, multiply, normalize
 
 World = Float[Array, "p1 3 4 c"]
 """[R | t] of each joint in the world, and of the world itself in the last row; trials last."""
@@ -46,7 +46,9 @@ def forward(chain: Chain, pose: Pose, offsets: Float[Array, "p 3"]) -> World:
     _, joints, trials = rotations.shape
     top = (chain.parents < 0)[:, None, None]
     place = jnp.where(top, root[None], offsets[:, :, None])
-    local = jnp.concatenate([jnp.moveaxis(matrix(rotations), 2, 0), place[:, :, None]], axis=2)  # (P, 3, 4, C)
+    # computed along the joints, which are many, and turned round for the loop over them: (P, 3, 4, C)
+    turns = jnp.transpose(matrices(jnp.swapaxes(rotations, 1, 2)), (3, 0, 1, 2))
+    local = jnp.concatenate([turns, place[:, :, None]], axis=2)
     still = jnp.broadcast_to(jnp.eye(3, 4, dtype=rotations.dtype)[:, :, None], (3, 4, trials))
     world = jnp.concatenate([jnp.zeros((joints, 3, 4, trials), rotations.dtype), still[None]])
     # adds a row's own place to that of its parent: [R | t] [Q | s] = [R Q | R s + t]
@@ -64,6 +66,25 @@ def forward(chain: Chain, pose: Pose, offsets: Float[Array, "p 3"]) -> World:
         return jax.lax.dynamic_update_index_in_dim(world, here, j, 0), None
 
     return jax.lax.scan(step, world, xs)[0]
+
+
+# the matrix of v x . is the sum of v_k times these
+_SKEW = np.zeros((3, 3, 3))
+for _k in range(3):
+    _SKEW[_k, (_k + 2) % 3, (_k + 1) % 3], _SKEW[_k, (_k + 1) % 3, (_k + 2) % 3] = 1, -1
+
+
+def matrices(q: Float[Array, "4 c p"]) -> Float[Array, "3 3 c p"]:
+    """Rotation matrices `(w^2 - |v|^2) I + 2 (v v' + w [v x])` of unit quaternions, as one expression over whole arrays: their nine
+    elements one by one would be nine branches in a loop."""
+    shape = q.shape[1:]
+    q = q.reshape(4, -1)
+    w, v = q[0], q[1:]
+    square = w * w - v[0] * v[0] - v[1] * v[1] - v[2] * v[2]
+    eye = jnp.eye(3, dtype=q.dtype)[..., None]
+    skew = jnp.asarray(_SKEW, q.dtype)[..., None]
+    across = skew[0] * v[0] + skew[1] * v[1] + skew[2] * v[2]
+    return (square * eye + 2 * (v[:, None] * v[None] + w * across)).reshape(3, 3, *shape)
 
 
 def times(a: Float[Array, "... i j c"], b: Float[Array, "... j k c"]) -> Float[Array, "... i k c"]:
@@ -96,20 +117,36 @@ def inverse_of(q: Float[Array, "4 ..."]) -> Float[Array, "4 ..."]:
 def moved(chain: Chain, pose: Pose, parent: Float[Array, "p 3 3"], step: Float[Array, "n c"]) -> Pose:
     """The trials that `step` makes of the one pose (C = 1) whose joints' parents have world rotations `parent`.
 
-    step: root translation, then for each joint a rotation vector, all along world axes. A turn by `w` is made by Cayley's map,
-    the quaternion along (1, w / 2): the exponential up to the third order, without its sines. Limits are kept by clamping
-    the rotation vector of a joint's rotation.
+    step: root translation, then for each joint a rotation vector, all along world axes.
     """
-    joints = parent.shape[0]
-    turn = step[3:].reshape(joints, 3, -1)
-    local = jnp.sum(
-        parent[:, :, :, None] * turn[:, :, None, :], axis=1
-    )  # R_parent^T w: the same turn seen from the parent
-    turn = jnp.concatenate([jnp.ones_like(local[:, :1]), local / 2], axis=1)
-    q = normalize(compose(jnp.moveaxis(turn, 1, 0), pose.rotations))
+    turn = step[3:].reshape(parent.shape[0], 3, -1)
+    return stepped(chain, pose, answers(pose, parent), step[:3], jnp.transpose(turn, (1, 2, 0)))
+
+
+def answers(pose: Pose, parent: Float[Array, "p 3 3"]) -> Float[Array, "4 4 p"]:
+    """The unit quaternion of each joint of one pose (C = 1), and how it begins to answer half a turn about each axis of the world:
+    the axis, seen from the parent, times the quaternion. What is the same for all trials of a pose."""
+    q = normalize(pose.rotations[:, :, 0])
+    axes = jnp.moveaxis(parent, 0, 2)  # the rows of a parent's rotation are the world's axes in its frame
+    return jnp.stack([q, *[multiply((jnp.zeros_like(q[0]), *axis), q) for axis in axes]])
+
+
+def stepped(
+    chain: Chain, pose: Pose, answer: Float[Array, "4 4 p"], root: Float[Array, "3 c"], turn: Float[Array, "3 c p"]
+) -> Pose:
+    """`moved`, from what `answers` gave and the steps of the root and, axis by axis, of the joints.
+
+    A turn by `w` is made by Cayley's map, the quaternion along (1, w / 2): the exponential up to the third order, without its
+    sines. Limits are kept by clamping the rotation vector of a joint's rotation.
+    """
+    x, y, z = turn / 2
+    scale = 1 / jnp.sqrt(1 + x * x + y * y + z * z)
+    q, *change = answer[:, :, None]
+    q = (q + x * change[0] + y * change[1] + z * change[2]) * scale
+    q = jnp.swapaxes(q, 1, 2)
     if chain.limits is not None:
         q = within_limits(q, chain.limits)
-    return Pose(q, pose.root + step[:3])
+    return Pose(q, pose.root + root)
 
 
 def within_limits(q: Float[Array, "4 p c"], limits: Float[Array, "p 3 2"]) -> Float[Array, "4 p c"]:

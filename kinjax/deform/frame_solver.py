@@ -24,9 +24,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..numerics import safe_divide, safe_sqrt
 from ..rotations import log
-from .chain import Chain, Pose, World, compose, forward, inverse_of, moved, parent_rotations
+from .chain import Chain, Pose, World, answers, compose, forward, inverse_of, parent_rotations, stepped
 from .loops import Loop, plain
-from .prioritized import factorize, layered_step, outside, times
+from .prioritized import combined, factorize, layered_step, outside, times
 from .tasks import CENTER_OF_MASS, Goals, Kinds, Tasks, jacobian, look, residuals
 
 PULLS = (1.0, 0.25)
@@ -184,7 +184,6 @@ class _Iteration:
         self.rows = jnp.repeat(tasks.layer, 3)
         self.limbs = jnp.repeat(tasks.kind, 3) != CENTER_OF_MASS  # a centre of mass has no joint that snaps
         self.members = (self.rows[None, :] == jnp.arange(layers, dtype=jnp.int32)[:, None]).astype(offsets.dtype)
-        self.block = jnp.kron(jnp.eye(tasks.kind.shape[0], dtype=offsets.dtype), jnp.ones((3, 3), offsets.dtype))
 
     def evaluate(self, pose: Pose) -> tuple[World, Float[Array, "m c"], Float[Array, "layers c"]]:
         """World transforms, residuals and each layer's error of all trials."""
@@ -224,7 +223,7 @@ class _Iteration:
         held = jnp.where((rows == depth - 1) & self.limbs, solving.drag, 0.0).astype(jac.dtype)
         factors = factorize(jac, rows, damping, (held, solving.singular), s.travel)
         across = factors.basis.rows
-        correct = partial(layered_step, factors, layer=rows, layers=layers, block=self.block, budget=solving.budget)
+        correct = partial(layered_step, factors, layer=rows, layers=layers, width=3, budget=solving.budget)
         y = correct(r0, clamp=solving.clamp * s.trust[rows], drag=True)
         parent = parent_rotations(self.chain, s.world)
         z = outside(factors.basis, attraction(self.reference, s.pose, parent))
@@ -235,8 +234,10 @@ class _Iteration:
         last = jnp.concatenate([jnp.full((pulls,), layers, jnp.int32), jnp.arange(layers, 0, -1, dtype=jnp.int32)])
         posture = jnp.concatenate([s.pull * jnp.asarray(PULLS, jac.dtype), jnp.zeros(layers, jac.dtype)])
         use = (rows[:, None] < last[None, :]).astype(jac.dtype)
+        # what a step may leave: of the last layer what damping left, of those above it nothing
         expected = r0[:, None] - times(factors.basis.factors, y[:, None] * use)
-        # the layers above the last of a candidate (all of them, under posture) take back what the step's curvature did
+        expected = jnp.where((rows < depth - 1)[:, None], jnp.zeros_like(expected), expected)
+        # the layers above the last of a candidate (all of them, under posture) take back what the step left besides
         mend = (
             rows[:, None] < jnp.maximum(last - (jnp.arange(layers + pulls) >= pulls).astype(jnp.int32), 1)[None, :]
         ).astype(jac.dtype)
@@ -247,9 +248,15 @@ class _Iteration:
         def wrong(r: Float[Array, "m c"]) -> Float[Array, "m c"]:
             return mend * (r * counts[:, None] - expected)
 
+        # of all trials the same: how the pose answers, and the steps of its joints axis by axis
+        answer = answers(s.pose, parent)
+        turns, home = (jnp.swapaxes(x[..., 3:].reshape(*x.shape[:-1], -1, 3), -1, -2) for x in (across, z))
+
         def attempt(tried: Tried) -> Tried:
             along = tried.along + mend * fix(wrong(tried.residual))
-            trial = moved(self.chain, s.pose, parent, times(across.T, along) + z[:, None] * posture[None, :])
+            turn = combined(turns, along) + posture[:, None, None] * home
+            root = combined(across[:, :3], along) + posture[:, None] * z[:3]
+            trial = stepped(self.chain, s.pose, answer, root.T, jnp.swapaxes(turn, 0, 1))
             world, r, errors = self.evaluate(trial)
             everything = jnp.concatenate([errors, s.errors[:, None]], axis=1)
             allowed = (everything <= caps[:, None]).all(0).at[-1].set(True)
@@ -266,7 +273,6 @@ class _Iteration:
         zero = jnp.zeros((), jnp.int32)
         none = Tried(y[:, None] * use, spread[0], spread[1], expected, s.errors[:, None] + 0 * posture, zero, zero)
         along, trial, world, r, errors, best, _ = self.loop(unsettled, attempt, none)
-        step = times(across.T, along) + z[:, None] * posture[None, :]
         everything = jnp.concatenate([errors, s.errors[:, None]], axis=1)
         stay = best == layers + pulls
         pick = jnp.minimum(best, layers + pulls - 1)
@@ -274,7 +280,7 @@ class _Iteration:
         def take(x: Array, old: Array) -> Array:
             return jnp.where(stay, old, jax.lax.dynamic_index_in_dim(x, pick, x.ndim - 1, keepdims=True))
 
-        kept = take(step, jnp.zeros_like(step[:, :1]))
+        kept = take(along, jnp.zeros_like(y)[:, None])[:, 0] @ across + take(posture, jnp.zeros_like(posture[:1])) * z
         # what the whole attraction cost, and how much of it would cost half the slack (the cost grows with its square)
         best_yet = jnp.min(everything, axis=1)
         room = jnp.maximum(solving.slack, solving.slack_ratio * best_yet)
@@ -296,7 +302,7 @@ class _Iteration:
             (members @ jnp.sum(across**2, axis=1)).round().astype(jnp.int32),
             solo,
             own,
-            s.travel + kept[:, 0],
+            s.travel + kept,
             self._trust(s.trust, best),
             pull,
         )

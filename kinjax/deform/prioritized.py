@@ -38,35 +38,50 @@ def times(a: Float[Array, "i j"], b: Float[Array, "j *k"]) -> Float[Array, "i *k
     return jnp.sum(a.reshape(*a.shape, *[1] * (b.ndim - 1)) * b[None], axis=1)
 
 
+def combined(rows: Float[Array, "m *n"], along: Float[Array, "m c"]) -> Float[Array, "c *n"]:
+    """For every trial the sum of the rows by its shares `along`."""
+    flat = jnp.matmul(along.T, rows.reshape(rows.shape[0], -1), precision="highest")
+    return flat.reshape(-1, *rows.shape[1:])
+
+
 def row_basis(jacobian: Float[Array, "m n"]) -> Basis:
     """Orthonormal basis of the rows in their order, by classical Gram-Schmidt applied twice.
 
     A row that lies in the span of those before it to within `16 eps` of its length, or is zero, gets a zero row.
     """
-    m = jacobian.shape[0]
-    tau = NOISE * eps_of(jacobian)
+    m, n = jacobian.shape
+    tau2 = (NOISE * eps_of(jacobian)) ** 2
+    index = jnp.arange(m, dtype=jnp.int32)
 
     def add(k: Int[Array, ""], basis: Basis) -> Basis:
+        # rows from the k-th on are still those of the Jacobian: the product with all rows gives the row's own square, too
         q, r = basis
-        v = jax.lax.dynamic_index_in_dim(jacobian, k, 0, keepdims=False)
+        before = index < k
+        v = jax.lax.dynamic_index_in_dim(q, k, 0, keepdims=False)
         c1 = q @ v
+        size2 = jax.lax.dynamic_index_in_dim(c1, k, 0, keepdims=False)
+        c1 = jnp.where(before, c1, jnp.zeros_like(c1))
         v1 = v - c1 @ q
-        n1 = safe_sqrt(v1 @ v1)
-        u = safe_divide(v1, n1)
-        c2 = q @ u
-        u2 = u - c2 @ q
-        n2 = safe_sqrt(u2 @ u2)
+        q = jax.lax.dynamic_update_index_in_dim(q, v1, k, 0)
+        c2 = q @ v1
+        first2 = jax.lax.dynamic_index_in_dim(c2, k, 0, keepdims=False)
+        c2 = jnp.where(before, c2, jnp.zeros_like(c2))
+        v2 = v1 - c2 @ q
+        left2 = first2 - jnp.sum(c2 * c2)
         # the second pass loses length only where the first left nothing but noise
-        keep = (n1 > tau * safe_sqrt(v @ v)) & (n2 > 0.5)
-        row = jnp.where(keep, safe_divide(u2, n2), jnp.zeros_like(u2))
-        factors = (c1 + n1 * c2).at[k].set(jnp.where(keep, n1 * n2, jnp.zeros_like(n1)))
+        keep = (first2 > tau2 * size2) & (left2 > 0.25 * first2)
+        left = jnp.sqrt(jnp.where(keep, left2, jnp.ones_like(left2)))
+        row = v2 * jnp.where(keep, 1 / left, jnp.zeros_like(left))
+        factors = jnp.where(index == k, jnp.where(keep, left, jnp.zeros_like(left)), c1 + c2)
         return Basis(
             jax.lax.dynamic_update_index_in_dim(q, row, k, 0),
             jax.lax.dynamic_update_index_in_dim(r, factors, k, 0),
         )
 
-    start = Basis(jnp.zeros_like(jacobian), jnp.zeros((m, m), jacobian.dtype))
-    return jax.lax.fori_loop(0, m, add, start)
+    # rows of whole vectors: their products have no remainder
+    start = Basis(jnp.pad(jacobian, ((0, 0), (0, -n % 8))), jnp.zeros((m, m), jacobian.dtype))
+    rows, factors = jax.lax.fori_loop(0, m, add, start)
+    return Basis(rows[:, :n], factors)
 
 
 class Layered(NamedTuple):
@@ -150,43 +165,49 @@ def layered_step(
     residual: Float[Array, "m *c"],
     layer: Int[Array, " m"],
     layers: int,
-    block: Float[Array, "m m"],
+    width: int,
     clamp: Float[Array, "*m"] | float,
     budget: Float[Array, ""] | float,
     drag: bool = False,
 ) -> Float[Array, "m *c"]:
     """Coordinates `y` of the step in the row basis: `dm = y Q`. Those of a layer do not depend on the layers below it.
 
-    residual: what each row should still move by, of one trial or of several (last axis). block: ones where two rows belong
-    to one constraint; no constraint of a layer asks for more than `clamp` (one number, or one a row). budget: the longest step in all,
-    spent in order of priority (cutting the whole step would let a lower layer's long step shrink a higher one's). drag:
-    whether the drag of `factorize` takes part.
+    residual: what each row should still move by, of one trial or of several (last axis). width: rows of one constraint; no
+    constraint of a layer asks for more than `clamp` (one number, or one a row, the same for a whole layer). budget: the longest
+    step in all, spent in order of priority (cutting the whole step would let a lower layer's long step shrink a higher
+    one's). drag: whether the drag of `factorize` takes part.
     """
-    rest = factors.rest if drag else jnp.zeros_like(factors.rest)
+    trials = residual.reshape(residual.shape[0], -1)
+    rest = (factors.rest if drag else jnp.zeros_like(factors.rest))[:, None]
+    owner = layer[::width]
+    below = (owner[None, :] < owner[:, None]).astype(residual.dtype)
+    beside = owner[None, :] == owner[:, None]
+    most = jnp.broadcast_to(jnp.asarray(clamp, residual.dtype), layer.shape)[::width, None]
 
-    below = layer[None, :] < layer[:, None]
-    beside = layer[None, :] == layer[:, None]
-    shape = (-1, *[1] * (residual.ndim - 1))
-    most = jnp.broadcast_to(jnp.asarray(clamp, residual.dtype), layer.shape).reshape(shape)
-    rest = rest.reshape(shape)
+    def squares(x: Float[Array, "m c"]) -> Float[Array, "b c"]:
+        x = x.reshape(-1, width, x.shape[1])
+        return jnp.sum(x * x, axis=1)
 
-    def sweep(_: Int[Array, ""], y: Float[Array, "m *c"]) -> Float[Array, "m *c"]:
-        r = residual - times(factors.carry, y)
+    def scaled(x: Float[Array, "m c"], by: Float[Array, "b c"]) -> Float[Array, "m c"]:
+        return (x.reshape(-1, width, x.shape[1]) * by[:, None]).reshape(x.shape)
+
+    def sweep(_: Int[Array, ""], y: Float[Array, "m c"]) -> Float[Array, "m c"]:
+        r = trials - times(factors.carry, y)
         # one factor for a layer, that of its farthest constraint: weights keep their say
-        length = safe_sqrt(times(block, r * r))
-        length = jnp.max(length[None] * beside.astype(r.dtype).reshape(*beside.shape, *[1] * (r.ndim - 1)), axis=1)
+        length = safe_sqrt(squares(r))
+        length = jnp.max(jnp.where(beside[..., None], length[None], jnp.zeros_like(length)), axis=1)
         # 1, not 0, where the length is 0: the derivative is that of what is not clamped
         far = length > most
-        r = r * jnp.where(far, most / jnp.where(far, length, jnp.ones_like(length)), jnp.ones_like(length))
+        r = scaled(r, jnp.where(far, most / jnp.where(far, length, jnp.ones_like(length)), jnp.ones_like(length)))
         y = times(factors.pull, r) + rest
         # what the layers above have spent, and what this one asks for
-        square = y * y
-        left = safe_sqrt(budget**2 - times(below.astype(y.dtype), square))
+        square = squares(y)
+        left = safe_sqrt(budget**2 - times(below, square))
         asked = times(beside.astype(y.dtype), square)
-        return y * jnp.where(asked > left * left, safe_divide(left, safe_sqrt(asked)), jnp.ones_like(asked))
+        return scaled(y, jnp.where(asked > left * left, safe_divide(left, safe_sqrt(asked)), jnp.ones_like(asked)))
 
     # layer i is final after i + 1 sweeps
-    return jax.lax.fori_loop(0, layers, sweep, jnp.zeros_like(residual))
+    return jax.lax.fori_loop(0, layers, sweep, jnp.zeros_like(trials)).reshape(residual.shape)
 
 
 def outside(basis: Basis, z: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -210,7 +231,6 @@ def solve(
     jacobian, residual: rows sorted by layer, the most important first (layer 0). damping: lambda of each row's layer.
     """
     factors = factorize(jacobian, layer, damping)
-    block = jnp.eye(residual.shape[0], dtype=residual.dtype)
-    y = layered_step(factors, residual, layer, layers, block, clamp, budget)
+    y = layered_step(factors, residual, layer, layers, 1, clamp, budget)
     step = y @ factors.basis.rows
     return step if z is None else step + outside(factors.basis, z)

@@ -81,12 +81,14 @@ def solve_sequence(
     kinds: Kinds,
     attract: tuple[bool, bool] = (True, True),
     loop: Loop = plain,
+    count: Int[Array, ""] | None = None,
 ) -> tuple[Carried, Solved]:
     """All frames in their order, from the pose `first` (C = 1); gives the last pose, too.
 
-    attract: whether joints, and the root's translation, are drawn to the input. A frame whose solve is not finite restarts
-    from the input and is flagged; where the input itself is not finite, the next frame starts from the last sound one.
-    loop: how a frame's loops are run (`loops`).
+    count: only so many of the frames; of the others the output is 0 (no reverse derivative then). attract: whether joints,
+    and the root's translation, are drawn to the input. A frame whose solve is not finite restarts from the input and is
+    flagged; where the input itself is not finite, the next frame starts from the last sound one. loop: how a frame's loops
+    are run (`loops`).
     """
 
     def step(carried: Carried, x: Frames) -> tuple[Carried, Solved]:
@@ -115,4 +117,14 @@ def solve_sequence(
         )  # fmt: skip
         return Carried(kept, before, trust, pull), out
 
-    return jax.lax.scan(step, first, frames)
+    if count is None:
+        return jax.lax.scan(step, first, frames)
+
+    def at(i: Int[Array, ""], state: tuple[Carried, Solved]) -> tuple[Carried, Solved]:
+        x = jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, i, 0, keepdims=False), frames)
+        carried, new = step(state[0], x)
+        return carried, jax.tree.map(lambda a, b: jax.lax.dynamic_update_index_in_dim(a, b, i, 0), state[1], new)
+
+    shapes = jax.eval_shape(step, first, jax.tree.map(lambda a: a[0], frames))[1]
+    none = jax.tree.map(lambda a: jnp.zeros((len(frames.root), *a.shape), a.dtype), shapes)
+    return jax.lax.fori_loop(0, count, at, (first, none))

@@ -23,7 +23,10 @@ from .settings import Settings
 from .tasks import Kinds
 
 PIECE = 32
-"""Frames that one call of the compiled program solves."""
+"""Frames after which a run over an edited clip looks whether it has come back to the old one; those of a call for several clips."""
+
+MOST = 256
+"""Frames that one call of the compiled program can solve."""
 
 SAME = 1e-9
 """Radians and metres within which two poses lead to the same next frames."""
@@ -41,9 +44,9 @@ class Run:
 
 
 @partial(jax.jit, static_argnames=("layers", "kinds", "attract"))
-def _solve(*args: Any, layers: int, kinds: Kinds, attract: tuple[bool, bool]) -> tuple[Carried, Solved]:
-    chain, tasks, frames, first, solving = args
-    return solve_sequence(chain, tasks, frames, first, solving, layers, kinds, attract)
+def _solve(*args: Any, layers: int, kinds: Kinds, attract: tuple[bool, bool]) -> Solved:
+    chain, tasks, frames, first, solving, count = args
+    return solve_sequence(chain, tasks, frames, first, solving, layers, kinds, attract, count=count)[1]
 
 
 @partial(jax.jit, static_argnames=("layers", "kinds", "attract"))
@@ -60,24 +63,30 @@ def solve(
     """All frames of one clip. old: an earlier run over the same motion; pieces that would come out the same are its own."""
     dtype = np.dtype(settings.precision)
     chain, tasks, cast = (as_dtype(t, dtype) for t in (plan.chain, plan.tasks, frames))
-    static = {"layers": plan.layers, "kinds": plan.kinds, "attract": (settings.attract, settings.attract_root)}
     numbers = solver_numbers(settings, dtype)
+    static = {"layers": plan.layers, "kinds": plan.kinds, "attract": (settings.attract, settings.attract_root)}
     count = len(frames.root)
     same = _unchanged(frames, asked, plan, old)
     pose = begin_pose(cast.rotations[0], cast.root[0], plan.layers)
     out: list[Any] = []
     linked = True  # the pose that enters this piece is the one that entered it in the old run
-    for begin in range(0, count, PIECE):
+    begin = 0
+    while begin < count:
         end = min(begin + PIECE, count)
         if old is not None and linked and same[begin:end].all():
             piece = _taken(old, plan, begin, end)
         else:
-            _, piece = _solve(chain, tasks, piece_of(cast, begin, end), pose, numbers, **static)
+            # as much at once as there is to solve in any case
+            while end < min(begin + MOST, count) and (old is None or not same[end : end + PIECE].all()):
+                end = min(end + PIECE, count)
+            some = np.asarray(end - begin, np.int32)
+            piece = _solve(chain, tasks, piece_of(cast, begin, end, MOST), pose, numbers, some, **static)
             piece = jax.tree.map(lambda x, n=end - begin: np.asarray(x)[:n], piece)
         out.append(piece)
         pose = _last(piece, cast, begin, pose)
         linked = old is not None and _close(pose, _last(_taken(old, plan, begin, end), cast, begin, pose))
         tell(end - begin)
+        begin = end
     return Run(plan, asked, frames, jax.tree.map(lambda *x: np.concatenate(x), *out))
 
 
@@ -95,7 +104,7 @@ def solve_many(plans: Sequence[Plan], settings: Settings, tell: Callable[[int], 
     out: list[Any] = []
     for begin in range(0, max(counts), PIECE):
         pieces = _stack(
-            [piece_of(f, min(begin, n - 1), min(begin + PIECE, n), begin >= n) for f, n in zip(cast, counts, strict=True)]
+            [piece_of(f, min(begin, n - 1), min(begin + PIECE, n), empty=begin >= n) for f, n in zip(cast, counts, strict=True)]
         )
         pose, piece = _solve_many(chain, tasks, pieces, pose, numbers, **static)
         out.append(jax.tree.map(np.asarray, piece))
@@ -129,10 +138,10 @@ def begin_pose(rotations: np.ndarray, root: np.ndarray, layers: int) -> Any:
     return Carried(pose, pose, ones[1:], ones[0])
 
 
-def piece_of(frames: Any, begin: int, end: int, empty: bool = False) -> Any:
-    """Frames `begin..end-1` filled up to `PIECE` with copies of the last, of which nothing is asked (of none, if `empty`)."""
+def piece_of(frames: Any, begin: int, end: int, size: int = PIECE, empty: bool = False) -> Any:
+    """Frames `begin..end-1` filled up to `size` with copies of the last, of which nothing is asked (of none, if `empty`)."""
     piece = jax.tree.map(lambda x: x[begin:end], frames)
-    more = PIECE - (end - begin)
+    more = size - (end - begin)
     if more:
         piece = jax.tree.map(lambda x: np.concatenate([x, np.repeat(x[-1:], more, axis=0)]), piece)
     if more or empty:

@@ -202,7 +202,8 @@ def jacobian(chain: Chain, tasks: Tasks, goals: Goals, world: World, seen: Seen,
         columns = columns + (turns * scale)[:, :, None, :] * body[:, None, :, None]
     columns = columns * tasks.recruits[:, None, :, None]
     root = directions * (rootward * tasks.root_recruited * goals.root_free)[:, None, None]
-    return jnp.concatenate([root.reshape(rows, 3), columns.reshape(rows, 3 * joints)], axis=1)
+    # the root first, as if it were one more joint: rows of one shape can be laid side by side without index arithmetic
+    return jnp.concatenate([root[:, :, None], columns], axis=2).reshape(rows, 3 + 3 * joints)
 
 
 def wrench(
