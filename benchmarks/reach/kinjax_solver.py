@@ -55,7 +55,7 @@ def run_loop(scene: Scene, path: str, k: int) -> Answer:
             motion = scene.motion()
             _PLANS[key] = motion, make_plan(motion, tuple(constraints(scene, path)), settings)
         motion, plan = _PLANS[key]
-        got = solve(plan, plan.frames, [], settings, lambda n: None, None)
+        got = solve(plan, plan.frames, settings, lambda n: None)
     out = output_motion(motion, plan, got.solved)
     return Answer(np.asarray(out.translations[:, 0]), np.asarray(out.rotations))
 

@@ -23,7 +23,7 @@ from .filtering import bridged, low_pass, roughness, taps
 from .plan import Plan, make_plan
 from .reporting import make_report, residual_table
 from .results import Deformation
-from .reuse import signatures
+from .reuse import alike
 from .settings import Settings
 from .solving import Run, solve, solve_many
 
@@ -95,11 +95,11 @@ def deform_many(
         for members in groups.values():
             if at_once:
                 solved = solve_many([plans[i] for i in members], settings, tell)
-                runs = [Run(plans[i], [], plans[i].frames, s) for i, s in zip(members, solved, strict=True)]
+                runs = [Run(plans[i], plans[i].frames, s) for i, s in zip(members, solved, strict=True)]
             else:
-                runs = [solve(plans[i], plans[i].frames, [], settings, tell, None) for i in members]
+                runs = [solve(plans[i], plans[i].frames, settings, tell) for i in members]
             for i, run in zip(members, runs, strict=True):
-                out[i] = _finish(motions[i], plans[i], settings, lambda n: None, run, ())
+                out[i] = _finish(motions[i], plans[i], settings, lambda n: None, run, (), None)
     return [d for d in out if d is not None]
 
 
@@ -121,12 +121,19 @@ def _deform(
 
     with jax.enable_x64(settings.precision == "float64"):
         plan = make_plan(motion, constraints, settings)
-        first = solve(plan, plan.frames, signatures(plan), settings, tell, old[0] if old else None)
-        return _finish(motion, plan, settings, tell, first, old)
+        same = alike(plan, old[0].plan) if old else None
+        first = solve(plan, plan.frames, settings, tell, old[0] if old else None, same)
+        return _finish(motion, plan, settings, tell, first, old, same)
 
 
 def _finish(
-    motion: Motion, plan: Plan, settings: Settings, tell: Callable[[int], None], first: Run, old: tuple[Run, ...]
+    motion: Motion,
+    plan: Plan,
+    settings: Settings,
+    tell: Callable[[int], None],
+    first: Run,
+    old: tuple[Run, ...],
+    same: np.ndarray | None,
 ) -> Deformation:
     """Filter where the displacement map is rough, enforce the constraints again, and report.
 
@@ -134,10 +141,9 @@ def _finish(
     a third pass frees it again, from there.
     """
     runs = [first]
-    asked = first.asked or signatures(plan)
     frames = smoothed(plan, first.solved, settings, float(motion.rate)) if settings.passes > 1 else None
     while frames is not None:
-        runs.append(solve(plan, frames, asked, settings, tell, old[len(runs)] if len(runs) < len(old) else None))
+        runs.append(solve(plan, frames, settings, tell, old[len(runs)] if len(runs) < len(old) else None, same))
         held = not frames.goals.root_free.all()
         if len(runs) == settings.passes or not held or not _worse(motion, plan, runs, settings):
             break

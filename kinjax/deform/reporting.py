@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..motion import Motion
-from ..quaternions import turns
+from ..quaternions import inverse, known, multiply, turns
 from .body import Body
 from .plan import Plan
 from .results import CONFLICT, CONVERGED, FREE, MAX_ITER, NONFINITE, STALLED, UNREACHABLE, Report
@@ -93,11 +93,7 @@ def make_report(before: Motion, after: Motion, plan: Plan, solved: Any, settings
     residual, code = np.full((f, b), np.nan), np.zeros((f, b), int)
     residual[:, list(plan.order)] = table
     code[:, list(plan.order)] = status
-    q0, q1 = np.asarray(before.rotations, float), np.asarray(after.rotations, float)
-    joints = q0.shape[1]
-    turn = turns(q1) * turns(q0).inv()
-    change = turn.magnitude().reshape(f, joints)
-    change[~(np.isfinite(q0).all(-1) & np.isfinite(q1).all(-1))] = np.nan
+    change = _changes(np.asarray(before.rotations, float), np.asarray(after.rotations, float))
     top = before.skeleton.topology
     root = top.translated.index(int(plan.kept[0])) if len(plan.kept) and int(plan.kept[0]) in top.translated else 0
     moved = np.linalg.norm(
@@ -117,3 +113,15 @@ def make_report(before: Motion, after: Motion, plan: Plan, solved: Any, settings
         passes=passes,
         notes=plan.notes,
     )
+
+
+def _changes(q0: np.ndarray, q1: np.ndarray) -> np.ndarray:
+    """(F, J) angles between two motions' rotations; NaN where one is not finite. Most joints are the same, bit for bit."""
+    out = np.zeros(q0.shape[:2])
+    some = (q0 != q1).any((0, 2))  # true of NaN, too
+    a, b = q0[:, some], q1[:, some]
+    finite = np.isfinite(a).all(-1) & np.isfinite(b).all(-1)
+    turn = multiply(known(b), inverse(known(a)))
+    angle = 2 * np.arctan2(np.linalg.norm(turn[..., 1:], axis=-1), np.abs(turn[..., 0]))
+    out[:, some] = np.where(finite, angle, np.nan)
+    return out

@@ -13,6 +13,14 @@ from .plan import Plan
 from .tasks import ORIENTATION
 
 
+def alike(plan: Plan, old: Plan) -> np.ndarray:
+    """(F,) the frames of which the same is asked in both plans; none, where they are for clips of other lengths."""
+    ours, theirs = signatures(plan), signatures(old)
+    if len(ours) != len(theirs):
+        return np.zeros(len(ours), bool)
+    return np.array([a == b for a, b in zip(ours, theirs, strict=True)])
+
+
 def signatures(plan: Plan) -> list[bytes]:
     """A digest of what is asked in each frame: the active constraints in order of priority, with their targets, whatever else
     is in the plan and wherever its joints are in the chain."""

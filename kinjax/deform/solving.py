@@ -34,11 +34,10 @@ SAME = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One pass over a clip: what was asked of each frame (`asked`, digests), the frames that it started from, and `solved`, in
-    the order of the plan's chain and constraints, padding included."""
+    """One pass over a clip: the frames that it started from, and `solved`, in the order of the plan's chain and constraints,
+    padding included."""
 
     plan: Plan
-    asked: list[bytes]
     frames: Any
     solved: Any
 
@@ -58,15 +57,21 @@ def _solve_many(*args: Any, layers: int, kinds: Kinds, attract: tuple[bool, bool
 
 
 def solve(
-    plan: Plan, frames: Frames, asked: list[bytes], settings: Settings, tell: Callable[[int], None], old: Run | None
+    plan: Plan,
+    frames: Frames,
+    settings: Settings,
+    tell: Callable[[int], None],
+    old: Run | None = None,
+    alike: np.ndarray | None = None,
 ) -> Run:
-    """All frames of one clip. old: an earlier run over the same motion; pieces that would come out the same are its own."""
+    """All frames of one clip. old: an earlier run over the same motion; pieces that would come out the same are its own. alike:
+    (F,) the frames of which the same is asked as then."""
     dtype = np.dtype(settings.precision)
     chain, tasks, cast = (as_dtype(t, dtype) for t in (plan.chain, plan.tasks, frames))
     numbers = solver_numbers(settings, dtype)
     static = {"layers": plan.layers, "kinds": plan.kinds, "attract": (settings.attract, settings.attract_root)}
     count = len(frames.root)
-    same = _unchanged(frames, asked, plan, old)
+    same = _unchanged(frames, alike, plan, old)
     pose = begin_pose(cast.rotations[0], cast.root[0], plan.layers)
     out: list[Any] = []
     linked = True  # the pose that enters this piece is the one that entered it in the old run
@@ -87,7 +92,7 @@ def solve(
         linked = old is not None and _close(pose, _last(_taken(old, plan, begin, end), cast, begin, pose))
         tell(end - begin)
         begin = end
-    return Run(plan, asked, frames, jax.tree.map(lambda *x: np.concatenate(x), *out))
+    return Run(plan, frames, jax.tree.map(lambda *x: np.concatenate(x), *out))
 
 
 def solve_many(plans: Sequence[Plan], settings: Settings, tell: Callable[[int], None]) -> list[Any]:
@@ -161,11 +166,11 @@ def _last(piece: Any, frames: Any, begin: int, before: Any) -> Any:
     return Carried(Pose(*pose), Pose(*own), piece.trust[-1], piece.pull[-1])
 
 
-def _unchanged(frames: Any, asked: list[bytes], plan: Plan, old: Run | None) -> np.ndarray:
+def _unchanged(frames: Any, alike: np.ndarray | None, plan: Plan, old: Run | None) -> np.ndarray:
     """(F,) the frames of which the same is asked as in the old run, from the same start."""
-    if old is None or len(asked) != len(old.asked):
-        return np.zeros(len(asked), bool)
-    same = np.array([a == b for a, b in zip(asked, old.asked, strict=True)])
+    if old is None or alike is None or len(alike) != len(old.frames.root):
+        return np.zeros(len(frames.root), bool)
+    same = alike.copy()
     ours, theirs = _shared(plan, old.plan)
     same &= (frames.rotations[:, :, ours] == old.frames.rotations[:, :, theirs]).all((1, 2))
     same &= (frames.offsets[:, ours] == old.frames.offsets[:, theirs]).all((1, 2))
