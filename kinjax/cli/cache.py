@@ -11,7 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 OFF = ("off", "0", "no", "none")
-FAST_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000"
+FAST_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000"
 
 
 def use_cache() -> Path | None:

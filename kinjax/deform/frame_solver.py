@@ -264,9 +264,9 @@ class _Iteration:
             return Tried(along, trial, world, r, errors, best, tried.times + 1)
 
         def unsettled(tried: Tried) -> Bool[Array, ""]:
-            # one correction where the step was curved, a second where all layers together, posture apart, are still refused
+            # one correction where the step was curved, two more where all layers together, posture apart, are still refused
             curved = jnp.max(jnp.abs(wrong(tried.residual))) > 0.1 * solving.slack
-            return (tried.times < 1) | (curved & ((tried.times < 2) | ((tried.times < 3) & (tried.best > pulls))))
+            return (tried.times < 1) | (curved & ((tried.times < 2) | ((tried.times < 4) & (tried.best > pulls))))
 
         # nothing has gone wrong before the first attempt: its residuals are those expected
         spread = jax.tree.map(lambda x: jnp.repeat(x, layers + pulls, axis=-1), (s.pose, s.world))

@@ -38,6 +38,13 @@ def times(a: Float[Array, "i j"], b: Float[Array, "j *k"]) -> Float[Array, "i *k
     return jnp.sum(a.reshape(*a.shape, *[1] * (b.ndim - 1)) * b[None], axis=1)
 
 
+def product(a: Float[Array, "i j"], b: Float[Array, "j k"]) -> Float[Array, "i k"]:
+    """Product of two matrices: written out where they are small, else row by row, which vectorises."""
+    if a.shape[0] < 16:
+        return times(a, b)
+    return jax.lax.scan(lambda _, row: (None, jnp.matmul(row, b, precision="highest")), None, a)[1]
+
+
 def combined(rows: Float[Array, "m *n"], along: Float[Array, "m c"]) -> Float[Array, "c *n"]:
     """For every trial the sum of the rows by its shares `along`."""
     flat = jnp.matmul(along.T, rows.reshape(rows.shape[0], -1), precision="highest")
@@ -119,16 +126,16 @@ def factorize(
     least = 1e-6 if jacobian.dtype == jnp.float64 else 1e-3
     lambda2 = jnp.maximum(damping * damping, least**2 * size2)
     lambda2 = jnp.where(lambda2 > 0, lambda2, jnp.ones_like(lambda2))
-    normal = times(own.T, own)
+    normal = product(own.T, own)
     carry = basis.factors - own
     if drag is None or travel is None:
-        return Layered(basis, times(inverse(normal + jnp.diag(lambda2)), own.T), jnp.zeros_like(lambda2), carry)
+        return Layered(basis, product(inverse(normal + jnp.diag(lambda2)), own.T), jnp.zeros_like(lambda2), carry)
     strength, sigma = drag
     used = times(same.astype(own.dtype), (jnp.sum(jacobian * jacobian, axis=1) > 0).astype(own.dtype))
     sigma2 = jnp.where(used > 0, sigma**2 * size2 / jnp.maximum(used, 1), jnp.ones_like(size2))
     hold = fading(normal, sigma2, strength)
     solve = inverse(normal + jnp.diag(lambda2) + hold)
-    return Layered(basis, times(solve, own.T), -times(solve, times(hold, basis.rows @ travel)), carry)
+    return Layered(basis, product(solve, own.T), -times(solve, times(hold, basis.rows @ travel)), carry)
 
 
 def fading(
@@ -136,9 +143,9 @@ def fading(
 ) -> Float[Array, "m m"]:
     """`strength^2 / (1 + (s / sigma)^2)^8` along each singular direction, of value `s`, of the layers' own rows; normal: R_ii' R_ii."""
     fade = inverse(jnp.eye(len(sigma2), dtype=normal.dtype) + normal / safe_sqrt(sigma2[:, None] * sigma2[None, :]))
-    fade = times(fade, fade)
-    fade = times(fade, fade)
-    return strength[:, None] * strength[None, :] * times(fade, fade)
+    fade = product(fade, fade)
+    fade = product(fade, fade)
+    return strength[:, None] * strength[None, :] * product(fade, fade)
 
 
 def inverse(a: Float[Array, "m m"]) -> Float[Array, "m m"]:

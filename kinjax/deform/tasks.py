@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from ..numerics import safe_divide, safe_sqrt
 from ..rotations import log
-from .chain import Chain, World, act, compose, inverse_of
+from .chain import Chain, World, act, compose, inverse_of, times
 
 RADIAN = 0.25
 """Metres that an error of one radian counts for: the reach of a hand or a foot."""
@@ -112,8 +112,7 @@ def residuals(tasks: Tasks, goals: Goals, seen: Seen, kinds: Kinds) -> Float[Arr
         along = act(back, along) if kinds.relative else along
         error = jnp.where(kind == LOOK_AT, RADIAN * _turn_between(along, error), error)
     if kinds.turns:
-        own = quaternion(seen.rotation)
-        own = compose(inverse_of(quaternion(seen.reference)), own) if kinds.relative else own
+        own = quaternion(times(back, seen.rotation) if kinds.relative else seen.rotation)
         turn = RADIAN * log(compose(jnp.broadcast_to(goals.rotation.T[:, :, None], own.shape), inverse_of(own)))
         error = jnp.where(kind == ORIENTATION, jnp.moveaxis(turn, 0, 1), error)
     return error * _scale(tasks, goals)[:, :, None]
@@ -123,34 +122,17 @@ def _scale(tasks: Tasks, goals: Goals) -> Float[Array, "b 3"]:
     return tasks.scale * goals.active[:, None]
 
 
-def _quadratic() -> np.ndarray:
-    """(4, 4, 10): 4 q q' as a linear function of (1, R11, R12, ..., R33)."""
-    c = np.zeros((4, 4, 10))
-    c[range(4), range(4), 0] = 1
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        c[0, 0, 1 + 4 * i] = 1
-        c[i + 1, 0, 1 + 3 * k + j] = c[0, i + 1, 1 + 3 * k + j] = 1
-        c[i + 1, 0, 1 + 3 * j + k] = c[0, i + 1, 1 + 3 * j + k] = -1
-        c[i + 1, i + 1, 1 + 4 * i] = 1
-        c[i + 1, i + 1, 1 + 4 * j] = c[i + 1, i + 1, 1 + 4 * k] = -1
-        for a, b in ((i, j), (j, i)):
-            c[a + 1, b + 1, 1 + 3 * i + j] = c[a + 1, b + 1, 1 + 3 * j + i] = 1
-    return c
-
-
-_QUADRATIC = _quadratic()
-
-
 def quaternion(r: Float[Array, "b 3 3 c"]) -> Float[Array, "4 b c"]:
     """Quaternions of rotation matrices: the row of `4 q q'` with the largest diagonal, so that no angle is special."""
-    b, _, _, c = r.shape
-    flat = jnp.concatenate([jnp.ones((b, 1, c), r.dtype), r.reshape(b, 9, c)], axis=1)
-    m = jnp.einsum("ijk,bkc->ijbc", jnp.asarray(_QUADRATIC, r.dtype), flat, precision="highest")
-    size = jnp.stack([m[i, i] for i in range(4)])
-    row = jnp.argmax(size, axis=0)
-    q = jnp.take_along_axis(m, row[None, None], axis=0)[0]
-    return q / jnp.sqrt(jnp.sum(q * q, axis=0))
+    x, y, z = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
+    size = (1 + x + y + z, 1 + x - y - z, 1 - x + y - z, 1 - x - y + z)
+    pairs = ((2, 1), (0, 2), (1, 0))
+    a, b, c = (r[:, i, j] - r[:, j, i] for i, j in pairs)  # 4 w x, 4 w y, 4 w z
+    d, e, f = (r[:, i, j] + r[:, j, i] for i, j in pairs)  # 4 y z, 4 z x, 4 x y
+    best = jnp.argmax(jnp.stack(size), axis=0)
+    rows = ((size[0], a, b, c), (a, size[1], f, e), (b, f, size[2], d), (c, e, d, size[3]))
+    q = [jnp.where(best == 0, w, jnp.where(best == 1, x, jnp.where(best == 2, y, z))) for w, x, y, z in zip(*rows, strict=True)]
+    return jnp.stack(q) / jnp.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
 
 
 def _turn_between(a: Float[Array, "b 3 c"], d: Float[Array, "b 3 c"]) -> Float[Array, "b 3 c"]:
