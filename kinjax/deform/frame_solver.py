@@ -287,6 +287,9 @@ class _Iteration:
         cost = jnp.max(jnp.where(below[:, 0], 0, (everything[:, 0] - best_yet) / room))
         pull = jnp.clip(s.pull * jnp.clip(safe_sqrt(safe_divide(0.5 * jnp.ones_like(cost), cost)), 1 / 8, 2), 1e-4, 1)
         pull = jnp.where(cost > 0, pull, jnp.minimum(2 * s.pull, 1))
+        # where a layer stays far off, the attraction bends a stretched limb that the layer stretches again: no more of it then
+        far = jnp.any((best_yet > jnp.maximum(solving.tolerance, 0.5 * s.errors)) & ~below[:, 0])
+        pull = jnp.where(far, jnp.minimum(pull, s.pull), pull)
         waiting = (best >= pulls) & (s.pull > 1e-3) & (jnp.max(jnp.abs(z)) > solving.tolerance)
         refused = jnp.arange(layers, dtype=jnp.int32) == layers + pulls - best
         waiting |= jnp.any(refused & (s.trust > LEAST) & (s.errors > solving.slack) & ~below[:, 0])
