@@ -168,7 +168,8 @@ def derivative(system: System, frame: Frames, at: Solved, factors: Factors) -> F
     form = _by_jacfwd if system.kinds.relative or system.kinds.looks else _in_closed_form
     change = form(system, frame, at, factors)
     q = factors.basis.rows
-    return change - times(q.T, times(factors.solve, times(factors.hold - factors.dragged, q)))
+    held = jnp.matmul(times(factors.solve, factors.hold - factors.dragged), q, precision="highest")
+    return change - jnp.matmul(q.T, held, precision="highest")
 
 
 def _by_jacfwd(system: System, frame: Frames, at: Solved, factors: Factors) -> Float[Array, "n n"]:
@@ -211,8 +212,8 @@ def _in_closed_form(system: System, frame: Frames, at: Solved, factors: Factors)
     pulls = [_attraction_change(chain, z) for z in ways]
     mixed = jnp.concatenate([jnp.repeat(stays_root, 3), jnp.repeat(stays, 3)])[:, None]
     free = (1 - mixed) * pulls[0] + mixed * pulls[1] + bent[layers]
-    travelled = times(factors.dragged, jnp.matmul(q, pulls[1], precision="highest"))
-    inner = times(factors.solve, own + travelled) - jnp.matmul(q, free, precision="highest")
+    travelled = jnp.matmul(factors.dragged, jnp.matmul(q, pulls[1], precision="highest"), precision="highest")
+    inner = jnp.matmul(factors.solve, own + travelled, precision="highest") - jnp.matmul(q, free, precision="highest")
     return free + jnp.matmul(q.T, inner, precision="highest")
 
 
