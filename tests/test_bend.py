@@ -216,6 +216,7 @@ def test_what_has_not_converged_says_so(x64):
     assert not bent.converged.any() and (bent.left > 1e-4).all()
 
 
+@pytest.mark.slow
 def test_float32_gradients_are_those_of_float64():
     with jax.enable_x64(True):
         exact = reach((0.02, -0.05, 0.04))

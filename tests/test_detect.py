@@ -122,6 +122,7 @@ def test_spikes_are_removed_and_do_not_cut(foot):
     assert len(detect(spoiled.poses).constraints) == len(detect(foot.poses).constraints)
 
 
+@pytest.mark.slow
 def test_calibrated_patterns_equal_templates(walk):
     template = [Template("LeftFoot", *_stance(walk))]
     pattern = calibrate(walk.motion, template)

@@ -405,6 +405,7 @@ def assert_whole(scores, precision=0.97, recall=0.85):
 
 
 @pytest.mark.parametrize("condition", ["clean", "3 mm white"])
+@pytest.mark.slow
 def test_pivots_make_stances_of_c3d_files_whole(data, trials, condition):
     assert_whole(whole_stances(data, trials, condition))
 

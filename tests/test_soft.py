@@ -178,6 +178,7 @@ def test_a_body_at_rest_and_one_never_seen_have_finite_gradients():
         assert labels[0].min() > 0.9 and labels[0, 2:-2].min() > 0.999 and (labels[1] == 0).all()
 
 
+@pytest.mark.slow
 def test_a_bad_clip_leaves_the_others_of_a_batch_as_they_are():
     tasks = [soft.prepare(walk(noise=n)) for n in (0.001, 0.002, 0.0)]
     clips = jax.tree.map(lambda *x: jnp.stack(x), *[t.clip for t in tasks])
