@@ -544,3 +544,34 @@ def test_mass_in_another_tree_counts_and_is_moved_by_the_input_alone():
         np.testing.assert_array_equal(one[:, -1], other[:, -1])
     before, after = (Body(m, np.zeros(3)).center() for m in (both, done.motion))
     np.testing.assert_allclose((after - before)[20:], np.tile([0.02, 0, 0.01], (20, 1)), atol=1e-4)
+
+
+def accelerations(motion: Motion) -> np.ndarray:
+    """(F - 2,) changes of the joints' turns from frame to frame, all joints together, by SciPy alone; mrad."""
+    from scipy.spatial.transform import Rotation
+
+    total = np.zeros(motion.frames - 2)
+    for q in np.moveaxis(motion.rotations, 1, 0):
+        turn = Rotation.from_quat(q, scalar_first=True)
+        total += (np.diff((turn[1:] * turn[:-1].inv()).as_rotvec(), axis=0) ** 2).sum(1)
+    return 1e3 * np.sqrt(total)
+
+
+def test_a_limb_out_of_reach_neither_trembles_nor_falls_short():
+    """A hand is led away beyond its reach, and half of the way back. It keeps within 1 % of the nearest place that it can
+    have, and moves there as smoothly as a stretched limb does: an attraction that bends what the hand stretches again has
+    twice the accelerations."""
+    motion = standing(160, sway=0.1)
+    way = np.array([1, -0.5, 1]) / 1.5
+    path = world(motion, "RightHand") + 1.2 * np.sin(0.6 * np.pi * np.linspace(0, 1, 160))[:, None] * way
+    goals = [*FEET, Position("RightHand", path=path, priority=1)]
+    d = deform(motion, goals, Settings(filter_root=None))
+    nearest = deform(motion, goals, Settings(filter_root=None, drag=0.0, iterations=60))
+    error, least = d.report.residual[:, 2], nearest.report.residual[:, 2]
+    assert least.max() > 0.19
+    assert error.max() <= 1.01 * least.max()
+    assert d.report.residual[:, :2].max() < 1e-5
+    beyond = accelerations(d.motion)[error[1:-1] > 0.1 * error.max()]
+    assert len(beyond) > 80
+    assert beyond.max() < 25
+    assert np.sqrt((beyond**2).mean()) < 8

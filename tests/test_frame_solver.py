@@ -9,11 +9,11 @@ import pytest
 from deform_cases import ENDS, FIGURE, NAMES, OFFSETS, PARENTS, Problems, chain, problems, quaternions, solve, standing
 
 from kinjax.deform import CenterOfMass, LookAt, Orientation, Position, Settings
-from kinjax.deform.chain import Pose, forward, moved, parent_rotations
+from kinjax.deform.chain import Pose, forward, matrices, moved, parent_rotations
 from kinjax.deform.frame_solver import Solving
 from kinjax.deform.plan import make_plan
 from kinjax.deform.prioritized import solve as solve_linear
-from kinjax.deform.tasks import jacobian, look, residuals
+from kinjax.deform.tasks import jacobian, look, quaternion, residuals
 from kinjax.motion import Motion
 
 
@@ -163,3 +163,22 @@ def assert_same_columns(ours, theirs, kept, model, order, world):
 
 def test_ends_are_where_the_figure_ends():
     assert [NAMES[e] for e in ENDS] == ["LeftFoot", "RightFoot", "LeftHand", "RightHand", "Head"]
+
+
+def test_matrices_and_quaternions_by_scipy(precision):
+    """Turns of any size, by half a turn about each axis and across, and by next to nothing."""
+    from scipy.spatial.transform import Rotation
+
+    rng = np.random.default_rng(8)
+    axes = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(60, 3))])
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    angles = np.array([0, 1e-9, 1e-4, 1, np.pi - 1e-4, np.pi - 1e-9, np.pi, 4])
+    turn = Rotation.from_rotvec((angles[:, None, None] * axes).reshape(-1, 3))
+    eps = 20 * np.finfo(precision).eps
+    q, r = turn.as_quat(scalar_first=True), turn.as_matrix()
+    made = matrices(jnp.asarray(q.T[:, None], precision))
+    np.testing.assert_allclose(np.moveaxis(np.asarray(made[:, :, 0]), -1, 0), r, atol=eps)
+    found = np.asarray(quaternion(jnp.asarray(np.moveaxis(r, 0, -1)[None], precision)))[:, 0].T
+    assert found.dtype == precision
+    sign = np.sign(np.sum(found * q, axis=1, keepdims=True))
+    np.testing.assert_allclose(found * sign, q, atol=eps)

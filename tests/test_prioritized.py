@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.numpy_baseline.deform import recursion
-from kinjax.deform.prioritized import factorize, inverse, layered_step, outside, row_basis, solve
+from kinjax.deform.prioritized import factorize, inverse, layered_step, outside, product, row_basis, solve
 
 LAYERS, ROWS, N = 5, 3, 30
 
@@ -160,3 +160,13 @@ def test_drag_spares_what_is_not_singular(scale, x64):
     f = layered_step(free, dx, jnp.zeros(3, jnp.int32), 1, 3, jnp.inf, jnp.inf)
     np.testing.assert_allclose(y[:2], f[:2], rtol=1e-6)
     assert abs(float(y[2])) < 1e-4 * abs(float(f[2]))
+
+
+@pytest.mark.parametrize("rows", [1, 15, 16, 45])
+def test_products_of_any_size(rows, precision):
+    """Few rows are written out, many are multiplied one by one."""
+    rng = np.random.default_rng(rows)
+    a, b = rng.normal(size=(rows, 7)), rng.normal(size=(7, N))
+    got = product(jnp.asarray(a, precision), jnp.asarray(b, precision))
+    assert got.dtype == precision
+    np.testing.assert_allclose(got, a @ b, atol=100 * np.finfo(precision).eps)

@@ -48,7 +48,7 @@ class Solving(NamedTuple):
     slack_ratio: float = 1e-4
     tolerance: float = 1e-5
     iterations: int = 10
-    drag: Array | float = 0.3
+    drag: Array | float = 0.2
     singular: float = 0.12
 
 
@@ -287,8 +287,8 @@ class _Iteration:
         cost = jnp.max(jnp.where(below[:, 0], 0, (everything[:, 0] - best_yet) / room))
         pull = jnp.clip(s.pull * jnp.clip(safe_sqrt(safe_divide(0.5 * jnp.ones_like(cost), cost)), 1 / 8, 2), 1e-4, 1)
         pull = jnp.where(cost > 0, pull, jnp.minimum(2 * s.pull, 1))
-        # where a layer stays far off, the attraction bends a stretched limb that the layer stretches again: no more of it then
-        far = jnp.any((best_yet > jnp.maximum(solving.tolerance, 0.5 * s.errors)) & ~below[:, 0])
+        # where a layer keeps an error, the attraction bends a stretched limb that the layer stretches again: no more of it then
+        far = jnp.any((best_yet > jnp.maximum(solving.slack, 0.5 * s.errors)) & ~below[:, 0])
         pull = jnp.where(far, jnp.minimum(pull, s.pull), pull)
         waiting = (best >= pulls) & (s.pull > 1e-3) & (jnp.max(jnp.abs(z)) > solving.tolerance)
         refused = jnp.arange(layers, dtype=jnp.int32) == layers + pulls - best

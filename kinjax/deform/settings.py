@@ -45,7 +45,7 @@ class Settings:
     budget: float = 1.0
     damping: float = 0.3
     damped_error: float = 0.05
-    drag: float = 0.3
+    drag: float = 0.2
     singular: float = 0.12
     slack: float = 1e-7
     slack_ratio: float = 1e-4
