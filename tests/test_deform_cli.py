@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from kinjax.cli import main
-from kinjax.cli.cache import FAST_LOOPS, plain_fusions, use_deform_flags
+from kinjax.cli.cache import EXTRA, FAST_LOOPS, plain_fusions, use_deform_flags
 from kinjax.formats import load, save, write_annotations
 from kinjax.formats.bvh_like import write_bvh_like
 from kinjax.synthetic import walking_biped
@@ -268,10 +268,11 @@ def test_wrong_input_is_one_line(
 @pytest.mark.parametrize(
     ("before", "after"),
     [
-        ("", f"{FAST_LOOPS} {plain_fusions()}".strip()),
-        ("--xla_dump_to=/x", f"--xla_dump_to=/x {FAST_LOOPS} {plain_fusions()}".strip()),
-        ("--xla_backend_extra_options=a=1", f"--xla_backend_extra_options=a=1 {plain_fusions()}".strip()),
-        ("--xla_cpu_use_fusion_emitters=true", f"--xla_cpu_use_fusion_emitters=true {FAST_LOOPS}"),
+        ("", f"{EXTRA}{FAST_LOOPS} {plain_fusions()}".strip()),
+        ("--xla_dump_to=/x", f"--xla_dump_to=/x {EXTRA}{FAST_LOOPS} {plain_fusions()}".strip()),
+        (f"{EXTRA}a=1", f"{EXTRA}a=1,{FAST_LOOPS} {plain_fusions()}".strip()),
+        (f"{EXTRA}{FAST_LOOPS}0,a=1", f"{EXTRA}{FAST_LOOPS}0,a=1 {plain_fusions()}".strip()),
+        ("--xla_cpu_use_fusion_emitters=true", f"--xla_cpu_use_fusion_emitters=true {EXTRA}{FAST_LOOPS}"),
     ],
 )
 def test_flags_for_deforming_are_set_unless_the_user_has_said_otherwise(

@@ -11,7 +11,9 @@ from importlib.metadata import version
 from pathlib import Path
 
 OFF = ("off", "0", "no", "none")
-FAST_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000"
+EXTRA = "--xla_backend_extra_options="
+FAST_LOOPS = "xla_cpu_small_while_loop_byte_threshold=10000000"
+"""One of XLA's extra options, of which all stand in one flag."""
 
 
 def use_cache() -> Path | None:
@@ -60,8 +62,13 @@ def use_deform_flags() -> None:
 
     XLA reads this once, so it goes before JAX. Only for commands that deform; what the user has set stays.
     """
-    flags = os.environ.get("XLA_FLAGS", "")
-    for flag in (FAST_LOOPS, plain_fusions()):
-        if flag.partition("=")[0] not in flags:
-            flags = f"{flags} {flag}".strip()
-    os.environ["XLA_FLAGS"] = flags
+    flags = os.environ.get("XLA_FLAGS", "").split()
+    at = next((i for i, flag in enumerate(flags) if flag.startswith(EXTRA)), None)
+    if at is None:
+        flags.append(EXTRA + FAST_LOOPS)
+    elif FAST_LOOPS.partition("=")[0] not in flags[at]:
+        flags[at] += f",{FAST_LOOPS}"
+    plain = plain_fusions()
+    if plain and not any(flag.startswith(plain.partition("=")[0]) for flag in flags):
+        flags.append(plain)
+    os.environ["XLA_FLAGS"] = " ".join(flags)
