@@ -33,30 +33,35 @@ def world_transforms(
     row after the last joint's is the identity, the parent of the roots. Derivatives are those along unit quaternions: what
     changes a quaternion's length alone changes nothing.
     """
-    if isinstance(rotations, tuple):
-        rotations = jnp.stack(rotations, axis=1)
-    joints, _, frames = rotations.shape
+    joints, frames = rotations[0].shape if isinstance(rotations, tuple) else rotations.shape[::2]
     if not moving.shape[0]:  # a row that no joint has
-        moving = jnp.zeros((1, 3, frames), rotations.dtype)
+        moving = jnp.zeros((1, 3, frames), offsets.dtype)
     own = jnp.full(joints, -1, jnp.int32).at[translated].set(jnp.arange(translated.shape[0], dtype=jnp.int32))
-    one, zero = jnp.ones(frames, rotations.dtype), jnp.zeros(frames, rotations.dtype)
+    one, zero = jnp.ones(frames, offsets.dtype), jnp.zeros(frames, offsets.dtype)
     identity = (one, *(zero,) * 6)
 
-    # one array a component, each of which a step writes in one vectorised pass (a concatenation would not be one). A step
-    # fetches its successor's parent after it has written: were its own fetched first, XLA would copy the arrays every step
+    # one array a component, each of which a step writes in one vectorised pass (a concatenation would not be one). It reads rows
+    # one by one: of a slice that is taken apart, XLA makes a function whose loop does not vectorise
+    def row(x: Array, at: Array) -> Array:
+        return jax.lax.dynamic_index_in_dim(x, at, 0, keepdims=False)
+
+    def rows(x: Array, at: Array) -> list[Array]:
+        flat, count = x.reshape(-1, frames), x.shape[1]
+        return [row(flat, at * count + k) for k in range(count)]
+
+    # a step fetches its successor's parent after it has written: were its own fetched first, XLA would copy the arrays every step
     def step(carried: Any, x: tuple[Array, ...]) -> tuple[Any, None]:
         world, above = carried
-        j, following, q, offset, path = x
-        moved = jax.lax.dynamic_index_in_dim(moving, jnp.maximum(path, 0), 0, keepdims=False)
-        t = [jnp.where(path >= 0, m, o) for m, o in zip(moved, offset, strict=True)]
+        j, following, offset, path = x
+        q = [row(r, j) for r in rotations] if isinstance(rotations, tuple) else rows(rotations, j)
+        t = [jnp.where(path >= 0, m, o) for m, o in zip(rows(moving, jnp.maximum(path, 0)), offset, strict=True)]
         here = (*multiply(above[:4], q), *(a + b for a, b in zip(above[4:], rotate(above[:4], t), strict=True)))
         world = tuple(jax.lax.dynamic_update_index_in_dim(w, h, j, 0) for w, h in zip(world, here, strict=True))
-        above = tuple(jax.lax.dynamic_index_in_dim(w, following, 0, keepdims=False) for w in world)
-        return (world, above), None
+        return (world, tuple(row(w, following) for w in world)), None
 
-    rows = jnp.where(parents < 0, joints, parents)
+    following = jnp.roll(jnp.where(parents < 0, joints, parents), -1)
     above = identity  # the first joint is a root
-    xs = jnp.arange(joints, dtype=jnp.int32), jnp.roll(rows, -1), rotations, offsets, own
+    xs = jnp.arange(joints, dtype=jnp.int32), following, offsets, own
     world = tuple(jnp.broadcast_to(x, (joints + 1, frames)) for x in identity)
     return jax.lax.scan(step, (world, above), xs)[0][0]
 
