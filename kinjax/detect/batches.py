@@ -27,8 +27,8 @@ def shape_of(clip: Prepared) -> tuple[object, ...]:
     """What clips that run in one batch have in common: kind, padded sizes, and rate."""
     a = clip.arrays
     if isinstance(a, Joints):
-        return "joints", a.rotations.shape, _moving(a), clip.lanes, clip.rate
-    return "poses", a.t.shape, 0, clip.lanes, clip.rate
+        return "joints", a.rotations.shape, _moving(a), a.at is None, clip.lanes, clip.rate
+    return "poses", a.t.shape, 0, False, clip.lanes, clip.rate
 
 
 def room_of(clip: Prepared) -> int:
@@ -45,10 +45,9 @@ def side_by_side(clips: Sequence[Prepared], room: int) -> tuple[Prepared, list[t
     if isinstance(parts[0], Joints):
         t = _moving(parts[0])
         filled = [_fixed(p, t) for p in parts if isinstance(p, Joints)]
-        unseen: Any = {"valid": np.zeros_like(filled[0].valid), "at": np.full_like(filled[0].at, -1)}
+        unseen: Any = {"valid": np.zeros_like(filled[0].valid), "used": np.zeros_like(filled[0].used)}
         nothing = filled[0]._replace(**unseen)
-        stacked: list[Any] = [np.stack(x) for x in zip(*filled, *[nothing] * (room - len(clips)), strict=True)]
-        arrays = Joints(*stacked)
+        arrays = jax.tree.map(lambda *x: np.stack(x), *filled, *[nothing] * (room - len(clips)))
     else:
         q, s, seen = (np.stack(x, axis=-3) for x in zip(*parts, strict=True))
         pad = lambda x, n: np.pad(x, [(0, 0)] * n + [(0, room - len(clips)), (0, 0), (0, 0)])  # noqa: E731

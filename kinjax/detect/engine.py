@@ -114,7 +114,7 @@ def run(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, give
         patterns,
         nu,
         pivot_noise,
-        jnp.sum(seen & ~valid, axis=-1, dtype=jnp.int32),
+        jnp.zeros(seen.shape[:1], jnp.int32) if paper else jnp.sum(seen & ~valid, axis=-1, dtype=jnp.int32),
         jnp.where(asked & (end - begin >= numbers.least), kind, NONE),
         begin,
         end,
@@ -285,6 +285,6 @@ def run_clips(
 def joint_poses(x: Joints) -> Clip:
     """World poses of the joints that are objects, origins at their segments' centres."""
     world = world_transforms(x.rotations, x.moving, x.offsets, x.parents, x.translated)
-    q, t = (jnp.stack([w[x.at] for w in part]) for part in (world[:4], world[4:]))  # -1: the identity, the last row
+    q, t = (jnp.stack(x.objects(part)) for part in (world[:4], world[4:]))
     t = jnp.stack([a + b for a, b in zip(t, rotate(q, x.centers.T[:, :, None]), strict=True)])
-    return Clip(q, t, x.valid & (x.at >= 0)[:, None])
+    return Clip(q, t, x.valid & x.used[:, None])

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from jaxtyping import Array, Bool, Float, Int
 
+from ..components import Parts
 from .merging import Tolerance
 from .noise import Pattern, Spans
 
@@ -71,7 +72,8 @@ class Clip(NamedTuple):
 
 class Joints(NamedTuple):
     """A skeleton's motion, padded: local `rotations`, `moving` translations of the `translated` joints, which frames are
-    `valid`; `at`: the joints that are objects (-1: padding), with the `centers` of their segments in their own frames."""
+    `valid`; `at`: the joints that are objects (-1: padding; None: they are all, in their order), with the `centers` of their segments in
+    their own frames; which objects are `used` (the others are padding)."""
 
     rotations: Float[Array, "joints 4 frames"]
     moving: Float[Array, "t 3 frames"]
@@ -79,8 +81,14 @@ class Joints(NamedTuple):
     offsets: Float[Array, "joints 3"]
     parents: Int[Array, " joints"]
     translated: Int[Array, " t"]
-    at: Int[Array, " objects"]
+    at: Int[Array, " objects"] | None
     centers: Float[Array, "objects 3"]
+    used: Bool[Array, " objects"]
+
+    def objects(self, world: Parts) -> Parts:
+        """The rows of the objects, of world transforms by joint (`forward.world_transforms`)."""
+        # a gather of rows that are in their order would cost as much as finding them did
+        return tuple(w[: self.used.shape[-1]] if self.at is None else w[self.at] for w in world)
 
 
 class Found(NamedTuple):

@@ -245,6 +245,7 @@ def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool, 
     centers, index = np.zeros((lanes, 3), dtype), np.full(lanes, -1, np.int32)
     centers[: len(at)] = motion.skeleton.segment_centers()[at]
     index[: len(at)] = [new[j] for j in at]
+    in_order = list(at) == list(joints) and lanes <= room
     arrays: Any = (
         rotations,
         translations,
@@ -252,8 +253,9 @@ def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool, 
         offsets,
         parents,
         np.array([new[j] for j in moving], np.int32),
-        index,
+        None if in_order else index,
         centers,
+        np.arange(lanes) < len(at),
     )
     rate = float(motion.rate)
     return Prepared(

@@ -22,6 +22,6 @@ def joint_poses(x: Joints) -> tuple[Parts, Parts, Bool[Array, "objects frames"]]
     local = normalize(tuple(jnp.where(x.valid, r, 0 if k else 1) for k, r in enumerate(rows)))
     moving = jnp.where(x.valid, x.moving, 0)
     world = world_transforms(local, moving, x.offsets, x.parents, x.translated)
-    q, t = (tuple(w[x.at] for w in part) for part in (world[:4], world[4:]))
+    q, t = x.objects(world[:4]), x.objects(world[4:])
     lever = rotate(q, tuple(x.centers[:, k, None] for k in range(3)))
-    return q, tuple(a + b for a, b in zip(t, lever, strict=True)), x.valid & (x.at >= 0)[:, None]
+    return q, tuple(a + b for a, b in zip(t, lever, strict=True)), x.valid & x.used[:, None]

@@ -54,7 +54,7 @@ def detect(
 def _padded(limits: Limits | tuple[Any, Any], task: Task, dtype: Any) -> Limits:
     """Thresholds for all lanes; those of padding are 1."""
     objects, n = len(task.objects), task.frames - task.plan.span
-    lanes = (task.clip.at if isinstance(task.clip, Joints) else task.clip.valid).shape[0]
+    lanes = (task.clip.used if isinstance(task.clip, Joints) else task.clip.valid).shape[0]
     out = []
     for name, x in zip(("sigma_max", "eps_max"), limits, strict=True):
         y = jnp.asarray(x, dtype)
