@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import jax
-
 from ..annotations import NoisePattern, Template
 from ..errors import OptionError
 from ..motion import Motion, Poses
@@ -91,7 +89,7 @@ def detect_prepared(
                 if name.casefold() == p.object.casefold()
             ]
             plan, found = _run(batch, settings, (), spread)
-            host = jax.device_get(found)
+            host = found.on_host()
             for i, (begin, end) in zip(some, lanes, strict=True):
                 out[i] = detection(clips[i], settings, plan, lanes_of(host, begin, end), (), patterns[i])
     return [out[i] for i in range(len(clips))]
@@ -117,7 +115,7 @@ def calibrate(
     names = list(dict.fromkeys(t.object for t in templates))
     clip = prepared(source, names, relative_to, settings)
     plan, found = _run(clip, settings, templates, ())
-    return pattern_records(clip, settings, plan, jax.device_get(found), templates)
+    return pattern_records(clip, settings, plan, found.on_host(), templates)
 
 
 def _run(

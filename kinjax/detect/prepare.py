@@ -26,6 +26,7 @@ Padded = Callable[[int], int]
 """From a number of frames to the length of the arrays: `lengths.bucket` or `lengths.octave`."""
 
 _PIECE = 512  # frames
+_LINE = 64  # bytes
 
 
 @dataclass(frozen=True)
@@ -186,10 +187,17 @@ def used_joints(motion: Motion, objects: Sequence[int]) -> tuple[tuple[int, ...]
     return tuple(sorted(needed)), tuple(k for k, j in enumerate(top.translated) if j in needed)
 
 
+def _aligned(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """An array that begins where a cache line does: JAX then takes it as it is, not a copy of it."""
+    size = int(np.prod(shape)) * dtype.itemsize
+    raw = np.empty(size + _LINE, np.uint8)
+    return raw[-raw.ctypes.data % _LINE :][:size].view(dtype).reshape(shape)
+
+
 def _frames_last(q: np.ndarray, joints: Sequence[int], room: int, length: int, dtype: np.dtype) -> np.ndarray:
     """Rotations (frames, all, 4) of some joints as (room, 4, length), filled up with the identity."""
     frames, count = len(q), len(joints)
-    out = np.empty((room, 4, length), dtype)
+    out = _aligned((room, 4, length), dtype)
     out[:, :, frames:] = out[count:] = np.eye(4)[0][:, None]
     if q.strides[0] == q.itemsize:  # as the readers leave it: each row is copied whole
         for i, j in enumerate(joints):

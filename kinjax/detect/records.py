@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
 from ..annotations import NoisePattern, Template
@@ -53,7 +52,7 @@ def detection(
     patterns: Sequence[NoisePattern],
 ) -> Detection:
     """Padding removed, frames of the original clip, positions in the world."""
-    host: Found = jax.device_get(found)
+    host = found.on_host()
     objects = len(clip.names)
     n = clip.frames - plan.span
     cut = lambda x: x[:objects, :n].T  # noqa: E731
