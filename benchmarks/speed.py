@@ -87,7 +87,8 @@ def projection() -> None:
 
 
 def walking_crowd(frames: int = 4500, joints: int = 31):
-    """A motion of 31 joints that rests and moves in turns, for timing (its content does not matter, its size does)."""
+    """A motion of 31 joints that rests and moves in turns, for timing (its content does not matter, its size does), in memory as
+    a reader leaves it: each component's frames side by side."""
     import numpy as np
     from scipy.spatial.transform import Rotation
 
@@ -98,6 +99,7 @@ def walking_crowd(frames: int = 4500, joints: int = 31):
     moving = (np.sin(np.arange(frames) / 40) > 0)[:, None, None]
     angles = np.cumsum(moving * rng.normal(size=(frames, joints, 3)) * 0.004, axis=0)
     q = Rotation.from_rotvec(angles.reshape(-1, 3)).as_quat()[:, [3, 0, 1, 2]].reshape(frames, joints, 4)
+    q = np.moveaxis(np.ascontiguousarray(np.moveaxis(q, 0, -1)), -1, 0)
     root = np.cumsum(moving * rng.normal(size=(frames, 1, 3)) * 0.002, axis=0)
     parents = (-1, *((i - 1) // 2 for i in range(1, joints)))
     offsets = rng.normal(size=(joints, 3)) * 0.1

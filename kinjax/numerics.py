@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -116,6 +116,17 @@ def running_sum(x: Float[Array, "... n"]) -> Float[Array, "... n"]:
     return (inside + before[..., None]).reshape(*x.shape[:-1], -1)[..., : x.shape[-1]]
 
 
+def running_sum_at(x: Float[Array, "lanes n"]) -> Callable[[Int[Array, "lanes k"]], Float[Array, "lanes k"]]:
+    """The inclusive running sums, to be looked up at a few places: without a pass that adds up what blocks begin with."""
+    inside, before = _blocks(x)
+    inside = inside.reshape(*x.shape[:-1], -1)
+
+    def at(index: Int[Array, "lanes k"]) -> Float[Array, "lanes k"]:
+        return jnp.take_along_axis(inside, index, axis=-1) + jnp.take_along_axis(before, index // BLOCK, axis=-1)
+
+    return at
+
+
 def running_count(flags: Bool[Array, "... n"]) -> Int[Array, "... n"]:
     """Inclusive running count along the last axis; exact up to 2^24."""
     return running_sum(flags.astype(jnp.float32)).astype(jnp.int32)
@@ -153,19 +164,27 @@ def bits_after(words: Bits) -> Bits:
     return (words >> jnp.uint32(1)) | (below << jnp.uint32(31))
 
 
-def _counts(words: Bits) -> tuple[Int[Array, "lanes words"], Int[Array, "lanes words"]]:
-    """Flags up to each word's end, and before its begin."""
+class Flags(NamedTuple):
+    """Packed flags, and how many are true up to each word's end, and before its begin."""
+
+    words: Bits
+    until: Int[Array, "lanes words"]
+    before: Int[Array, "lanes words"]
+
+
+def counted(words: Bits) -> Flags:
+    """Flags ready to be counted (exact up to 2^24): once, where a loop looks things up in them."""
     own = jax.lax.population_count(words).astype(jnp.int32)
-    until = jnp.cumsum(own, axis=-1, dtype=jnp.int32)
-    return until, until - own
+    until = running_sum(own.astype(jnp.float32)).astype(jnp.int32)
+    return Flags(words, until, until - own)
 
 
 def true_positions(
-    words: Bits, most: int, first: int | Int[Array, ""] = 0
+    flags: Flags, most: int, first: int | Int[Array, ""] = 0
 ) -> tuple[Int[Array, "lanes most"], Int[Array, " lanes"]]:
     """Indices of `most` true flags of each lane from number `first` on (beyond the last word where there are fewer), and the
     number of all."""
-    until, before = _counts(words)
+    words, until, before = flags
     rank = first + jnp.arange(1, most + 1, dtype=jnp.int32)
     block = jnp.sum(until[:, None, :] < rank[:, None], axis=-1, dtype=jnp.int32)
     found = jnp.minimum(block, words.shape[-1] - 1)
@@ -178,9 +197,9 @@ def true_positions(
     return jnp.where(rank <= total[:, None], place, jnp.asarray(32 * words.shape[-1], jnp.int32)), total
 
 
-def counts_at(words: Bits, index: Int[Array, "lanes k"]) -> Int[Array, "lanes k"]:
+def counts_at(flags: Flags, index: Int[Array, "lanes k"]) -> Int[Array, "lanes k"]:
     """How many flags are true up to each index, that one included."""
-    _, before = _counts(words)
+    words, _, before = flags
     block, bit = index // 32, (index % 32).astype(jnp.uint32)
     upto = (jnp.uint32(2) << bit) - jnp.uint32(1)
     own = jax.lax.population_count(jnp.take_along_axis(words, block, axis=1) & upto).astype(jnp.int32)

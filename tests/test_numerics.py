@@ -13,6 +13,7 @@ from kinjax.lengths import BLOCK, bucket
 from kinjax.numerics import (
     bits_after,
     bits_before,
+    counted,
     counts_at,
     eps_of,
     order_statistic,
@@ -171,7 +172,7 @@ def test_running_count_of_a_long_clip():
 @pytest.mark.parametrize("n", [1, 31, 64, 300])
 def test_true_positions(n):
     flags = np.random.default_rng(n).random((6, n)) < np.array([0, 0.02, 0.2, 0.5, 0.9, 1])[:, None]
-    find = jax.jit(lambda f: true_positions(packed_bits(f), 40))
+    find = jax.jit(lambda f: true_positions(counted(packed_bits(f)), 40))
     found, total = find(jnp.asarray(flags))
     np.testing.assert_array_equal(total, flags.sum(1))
     for row, f in zip(np.asarray(found), flags, strict=True):
@@ -202,7 +203,7 @@ def test_packed_bits_find_and_count_flags(n):
     rng = np.random.default_rng(n)
     flags = rng.random((4, n)) < np.array([[0.0], [0.1], [0.6], [1.0]])
     words = packed_bits(jnp.asarray(flags))
-    found, total = true_positions(words, n)
+    found, total = true_positions(counted(words), n)
     for lane in range(4):
         at = np.flatnonzero(flags[lane])
         assert total[lane] == len(at)
@@ -210,7 +211,7 @@ def test_packed_bits_find_and_count_flags(n):
         assert (np.asarray(found[lane][len(at) :]) >= n).all()
     index = rng.integers(0, n, (4, 50))
     expected = np.take_along_axis(np.cumsum(flags, axis=1), index, axis=1)
-    np.testing.assert_array_equal(counts_at(words, jnp.asarray(index, jnp.int32)), expected)
+    np.testing.assert_array_equal(counts_at(counted(words), jnp.asarray(index, jnp.int32)), expected)
     earlier, later = np.zeros_like(flags), np.zeros_like(flags)
     earlier[:, 1:], later[:, :-1] = flags[:, :-1], flags[:, 1:]
     whole = n // 32  # the last word may hold one shifted flag more

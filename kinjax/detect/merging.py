@@ -19,6 +19,7 @@ from ..numerics import (
     Bits,
     bits_after,
     bits_before,
+    counted,
     counts_at,
     in_chunks,
     packed_bits,
@@ -109,7 +110,7 @@ def runs(kind: Int[Array, "objects n"]) -> tuple[Bits, Bits]:
 def elements(
     kind: Int[Array, "objects n"],
     bounds: tuple[Bits, Bits],
-    counted: Bool[Array, "objects n"],
+    countable: Bool[Array, "objects n"],
     missing: Bool[Array, "objects n"],
     start: Float[Array, "3 objects n"],
     stop: Float[Array, "3 objects n"],
@@ -118,11 +119,12 @@ def elements(
     """What lies between each begin and end of `bounds`, in time order: a function of the first one's number and of how many,
     since fetching all that there is room for costs more than the few that there are; and their number.
 
-    counted: displacements that make a gap longer when they carry no constraint. missing: those that were not seen.
+    countable: displacements that make a gap longer when they carry no constraint. missing: those that were not seen.
     start, stop: where a displacement's constraint lies at its begin and at its end.
     """
     n = kind.shape[-1]
-    failed, lost = packed_bits(counted & (kind == NONE)), packed_bits(missing)
+    begins, ends = (counted(x) for x in bounds)
+    failed, lost = counted(packed_bits(countable & (kind == NONE))), counted(packed_bits(missing))
 
     def take(x: Array, at: Array) -> Array:
         return jnp.take_along_axis(x, at, axis=-1).T
@@ -131,8 +133,8 @@ def elements(
         return jnp.stack([take(row, at) for row in x])
 
     def find(begin: int | Int[Array, ""], most: int) -> Elements:
-        first, _ = true_positions(bounds[0], most, begin)
-        last, _ = true_positions(bounds[1], most, begin)
+        first, _ = true_positions(begins, most, begin)
+        last, _ = true_positions(ends, most, begin)
         i, j = jnp.minimum(first, n - 1), jnp.minimum(last, n - 1)
         return Elements(
             jnp.where((first < n).T, take(kind, i), NONE),
@@ -145,7 +147,7 @@ def elements(
             jnp.stack([counts_at(lost, i).T, counts_at(lost, j).T]),
         )
 
-    return find, jnp.sum(jax.lax.population_count(bounds[0]), axis=-1, dtype=jnp.int32)
+    return find, begins.until[:, -1]
 
 
 def merge(find: Find, total: Int[Array, " objects"], capacity: int, tolerance: Tolerance, lines: bool) -> Spans:
@@ -174,7 +176,7 @@ def _merged_rests(find: Find, most: Int[Array, ""], objects: int, capacity: int,
     start = (zero > 0, zero, zero, *(jnp.zeros((1, objects), tolerance.max_jump.dtype),) * 3)
     real, joins, first, last = in_chunks(chunk, start, capacity, most)[1]
     follows = jnp.concatenate([(real & joins)[1:], jnp.zeros((1, objects), bool)])
-    begins, ends = packed_bits((real & ~joins).T), packed_bits((real & ~follows).T)
+    begins, ends = (counted(packed_bits(x.T)) for x in (real & ~joins, real & ~follows))
 
     def pick(state: None, at: Int[Array, ""]) -> tuple[None, Spans]:
         (begin, total), (end, _) = true_positions(begins, CHUNK, at), true_positions(ends, CHUNK, at)
@@ -244,7 +246,7 @@ def _merged_in_order(find: Find, most: Int[Array, ""], objects: int, capacity: i
 def packed(spans: Spans, count: Int[Array, ""]) -> Spans:
     """Empty slots last, order kept; at most `count` are used, and the last slot goes: there is one more than elements."""
     slots = spans.kind.shape[0] - 1
-    used = packed_bits(spans.kind.T != NONE)
+    used = counted(packed_bits(spans.kind.T != NONE))
 
     def chunk(state: None, first: Int[Array, ""]) -> tuple[None, Spans]:
         at, total = true_positions(used, CHUNK, first)

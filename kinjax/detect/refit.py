@@ -8,13 +8,26 @@ minimum is the pivot, the null space of `M` the axis. Positions are taken from a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..numerics import CHUNK, in_chunks, running_count, running_sum, safe_divide, safe_norm, safe_sqrt
+from ..numerics import (
+    CHUNK,
+    counted,
+    counts_at,
+    in_chunks,
+    packed_bits,
+    running_count,
+    running_sum,
+    running_sum_at,
+    safe_divide,
+    safe_norm,
+    safe_sqrt,
+)
 from ..rotations import apply, apply_transposed, dot, matrix
 
 
@@ -128,22 +141,24 @@ def span_places(
     inside = valid & (running_sum(marks) > 0.5)
     path = [running_sum(s) for s in steps]
     d = [x - y for x, y in zip(t, path, strict=True)]
-    sums = [running_sum(jnp.where(inside, x, 0)) for x in (jnp.ones_like(t[0]), *d, dot(d, d))]
+    sums = [running_sum_at(jnp.where(inside, x, 0)) for x in (*d, dot(d, d))]
+    seen = counted(packed_bits(valid))
 
     def place(state: None, at: Int[Array, ""]) -> tuple[None, tuple[Array, ...]]:
         first, last, real = rows(begins, at), rows(ends, at), rows(used, at)
         origin = [_at(x, first).T for x in path]
         end_d = [_at(x, last).T - o for x, o in zip(t, origin, strict=True)]
-        ending = jnp.ones_like(origin[0]), *end_d, dot(end_d, end_d)  # the last frame may be the next span's first
-        seen = _at(valid, last).T
+        ending = *end_d, dot(end_d, end_d)  # the last frame may be the next span's first
+        earlier, until = jnp.maximum(first - 1, 0).T, jnp.maximum(last - 1, 0).T
+        with_last, after_first = _at(valid, last).T, first > 0
 
-        def total(sums: Array, ending: Array) -> Array:
-            earlier = jnp.where(first > 0, _at(sums, jnp.maximum(first - 1, 0)).T, 0)
-            between = jnp.where(real, _at(sums, jnp.maximum(last - 1, 0)).T - earlier, 0)
-            return between + jnp.where(seen, ending, 0)
+        def total(sums: Callable[[Array], Array], ending: Array) -> Array:
+            between = jnp.where(real, sums(until).T - jnp.where(after_first, sums(earlier).T, 0), 0)
+            return between + jnp.where(with_last, ending, 0)
 
-        n, *moments, square = (total(x, y) for x, y in zip(sums, ending, strict=True))
-        n = jnp.maximum(n, 1)
+        *moments, square = (total(x, y) for x, y in zip(sums, ending, strict=True))
+        number = counts_at(seen, last.T) - jnp.where(after_first.T, counts_at(seen, earlier), 0)
+        n = jnp.maximum(number.T.astype(t.dtype), 1)
         center = [x / n for x in moments]
         spread = safe_sqrt(jnp.maximum(square / n - dot(center, center), 0))
         return state, (*(x + o for x, o in zip(center, origin, strict=True)), spread)
