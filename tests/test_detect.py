@@ -6,9 +6,11 @@ import jax
 import numpy as np
 import pytest
 
+from benchmarks.speed import walking_crowd
 from kinjax import synthetic
 from kinjax.annotations import Template
 from kinjax.detect import Settings, calibrate, detect, detect_many
+from kinjax.detect.prepare import prepared
 from kinjax.errors import OptionError, ShapeError, TemplateError, TemplateTooShort, UnknownNameError
 from kinjax.kinematics import object_poses
 from kinjax.motion import make_poses
@@ -42,6 +44,20 @@ def test_names_in_any_case_and_order(walk):
     a = detect(walk.motion, ["rightfoot", "LEFTFOOT", "RightFoot"])
     assert a.objects == ("RightFoot", "LeftFoot")
     assert sorted(spans(a)) == sorted(spans(detect(walk.motion, FEET)))
+
+
+@pytest.mark.parametrize("method", ["paper", "robust"])
+def test_joints_in_their_order_are_the_same_in_any_other(method):
+    """All joints in the skeleton's order are taken as they are, in another order they are picked out one by one."""
+    options = {"method": method, "types": ("space",)} | ({"thresholds": (2e-3, 2e-3)} if method == "paper" else {})
+    motion = walking_crowd(600, 29)
+    names = motion.skeleton.names
+    a, b = detect(motion, **options), detect(motion, list(reversed(names)), **options)
+    assert prepared(motion, None, None, Settings()).arrays.at is None
+    assert b.objects == tuple(reversed(a.objects))
+    np.testing.assert_array_equal(a.sigma_3, b.sigma_3[:, ::-1])
+    found = [{(c.object, c.type, c.begin, c.end, *c.position) for c in d.constraints} for d in (a, b)]
+    assert found[0] == found[1] and found[0]
 
 
 @pytest.mark.parametrize("distance", [1e3])

@@ -20,6 +20,7 @@ from kinjax.numerics import (
     packed_bits,
     running_count,
     running_sum,
+    running_sum_at,
     safe_divide,
     safe_norm,
     safe_sqrt,
@@ -185,6 +186,21 @@ def test_running_sum(precision):
     x = np.random.default_rng(2).normal(size=(2, 3, 301)).astype(precision)
     np.testing.assert_allclose(running_sum(jnp.asarray(x)), np.cumsum(x, -1), atol=200 * np.finfo(precision).eps)
     assert running_sum(jnp.zeros((2, 0), precision)).shape == (2, 0)
+
+
+@pytest.mark.parametrize("n", [1, 32, 301])
+def test_running_sum_at_a_few_places(n, precision):
+    rng = np.random.default_rng(n)
+    x, index = rng.normal(size=(3, n)).astype(precision), rng.integers(0, n, (3, 40))
+    found = running_sum_at(jnp.asarray(x))(jnp.asarray(index, jnp.int32))
+    expected = np.take_along_axis(np.cumsum(x, -1), index, -1)
+    np.testing.assert_allclose(found, expected, atol=200 * np.finfo(precision).eps)
+
+
+def test_flags_are_counted_exactly_in_long_clips():
+    n = 2**22
+    flags = counted(packed_bits(jnp.ones((1, n), bool)))
+    np.testing.assert_array_equal(flags.until[0], np.arange(32, n + 1, 32))
 
 
 def test_buckets_are_monotone_few_and_little_padded():
