@@ -164,6 +164,22 @@ def bits_after(words: Bits) -> Bits:
     return (words >> jnp.uint32(1)) | (below << jnp.uint32(31))
 
 
+def bits_between(switches: Bits) -> Bits:
+    """True from every second switch on: from the first (included) to the second, from the third to the fourth, ..."""
+    x = switches
+    for k in (1, 2, 4, 8, 16):
+        x = x ^ (x << jnp.uint32(k))
+    odd = (x >> jnp.uint32(31)).astype(jnp.int32)
+    on = (jnp.cumsum(odd, axis=-1, dtype=jnp.int32) - odd) % 2
+    return x ^ -on.astype(jnp.uint32)
+
+
+def unpacked_bits(words: Bits, n: int) -> Bool[Array, "lanes n"]:
+    """The first `n` flags."""
+    flags = (words[..., None] >> jnp.arange(32, dtype=jnp.uint32)) & jnp.uint32(1)
+    return flags.reshape(words.shape[0], -1)[:, :n] > 0
+
+
 class Flags(NamedTuple):
     """Packed flags, and how many are true up to each word's end, and before its begin."""
 

@@ -11,6 +11,7 @@ from kinjax import synthetic
 from kinjax.annotations import Template
 from kinjax.detect import Settings, calibrate, detect, detect_many
 from kinjax.detect.prepare import prepared
+from kinjax.detect.refit import span_places
 from kinjax.errors import OptionError, ShapeError, TemplateError, TemplateTooShort, UnknownNameError
 from kinjax.kinematics import object_poses
 from kinjax.motion import make_poses
@@ -333,3 +334,33 @@ def test_window_refuses_patterns_that_it_would_not_use(walk):
     pattern = calibrate(walk.motion, [Template("LeftFoot", *_stance(walk))])
     with pytest.raises(OptionError, match="templates="):
         detect(walk.motion, ["LeftFoot"], method="window", patterns=pattern)
+
+
+def test_places_of_spans_by_plain_means():
+    """More spans than a chunk holds, that share end frames, are one frame long, a metre apart, or lie where frames are missing."""
+    rng = np.random.default_rng(4)
+    frames, objects, slots = 640, 3, 64
+    begin, end = np.zeros((slots, objects), np.int32), np.zeros((slots, objects), np.int32)
+    used = np.zeros((slots, objects), bool)
+    t = rng.normal(size=(3, objects, frames)) * 1e-4
+    for lane, most in enumerate((40, 7, 0)):
+        at, gap, where = 0, 1, 0.0
+        for k in range(most):
+            long = int(rng.choice([0, 1, 5, 12]))
+            begin[k, lane], end[k, lane], used[k, lane] = at, at + long, True
+            where = rng.normal(size=(3, 1)) if gap else where  # a frame of two rests is where both are
+            t[:, lane, at + (gap == 0) : at + long + 1] += where
+            gap = int(rng.choice([0, 1, 3])) if long else 1
+            at += long + gap
+        assert at < frames - 1
+    valid = rng.random((objects, frames)) < 0.9
+    for k, lane in zip(*np.nonzero(used), strict=True):
+        valid[lane, begin[k, lane]] = True  # rests begin where something is seen
+    t = np.where(valid, t, 0)
+    arguments = (jax.numpy.asarray(x) for x in (np.float32(t), valid, begin, end, used))
+    place = jax.jit(span_places)(*arguments)
+    for k, lane in zip(*np.nonzero(used), strict=True):
+        x = t[:, lane, begin[k, lane] : end[k, lane] + 1][:, valid[lane, begin[k, lane] : end[k, lane] + 1]]
+        np.testing.assert_allclose(place.center[:, k, lane], x.mean(1), atol=2e-6)
+        spread = np.sqrt(((x - x.mean(1, keepdims=True)) ** 2).sum(0).mean())
+        np.testing.assert_allclose(place.spread[k, lane], spread, atol=5e-6)

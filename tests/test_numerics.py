@@ -13,6 +13,7 @@ from kinjax.lengths import BLOCK, bucket
 from kinjax.numerics import (
     bits_after,
     bits_before,
+    bits_between,
     counted,
     counts_at,
     eps_of,
@@ -25,6 +26,7 @@ from kinjax.numerics import (
     safe_norm,
     safe_sqrt,
     true_positions,
+    unpacked_bits,
 )
 
 ROWS = ("N8", "N9", "N11")
@@ -233,3 +235,11 @@ def test_packed_bits_find_and_count_flags(n):
     whole = n // 32  # the last word may hold one shifted flag more
     for shifted, expected in ((bits_before(words), earlier), (bits_after(words), later)):
         np.testing.assert_array_equal(shifted[:, :whole], packed_bits(jnp.asarray(expected))[:, :whole])
+
+
+@pytest.mark.parametrize("n", [1, 32, 77, 320])
+def test_bits_between_switches(n):
+    switches = np.random.default_rng(n).random((5, n)) < np.array([[0], [0.05], [0.3], [0.9], [1]])
+    words = packed_bits(jnp.asarray(switches))
+    np.testing.assert_array_equal(unpacked_bits(words, n), switches)
+    np.testing.assert_array_equal(unpacked_bits(bits_between(words), n), np.cumsum(switches, axis=1) % 2 == 1)

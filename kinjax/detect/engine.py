@@ -160,13 +160,14 @@ def _thresholds(
     middle = jnp.arange(valid.shape[-1], dtype=jnp.int32).astype(numbers.rate.dtype) + (
         0.5 if plan.method == "paper" else plan.span / 2
     )
+    unmarked = jnp.zeros((valid.shape[0], 1), jnp.int32)
     values = [(points.sigma_3, points.eps_3)] * plan.space
     if plan.method == "paper" and plan.lines:
         values.append((points.sigma_1, points.eps_1))
     patterns, marks, limits = [], [], []
     for i, (sigma, eps) in enumerate(values):
         if plan.given:
-            pattern, mark = given[i], jnp.zeros(valid.shape, jnp.int32)
+            pattern, mark = given[i], unmarked
         elif plan.templates:
             pattern, mark = jax.vmap(
                 lambda s, e, v, spans, lo, hi: noise.template_pattern(
@@ -174,8 +175,9 @@ def _thresholds(
                 )
             )(sigma, eps, valid, templates[i], least, most)
         else:
-            pattern, mark = noise.no_pattern(nu[0]), jnp.zeros(valid.shape, jnp.int32)
-        curve = jax.vmap(lambda p, lo: noise.thresholds(p, middle, plan.interpolation, lo))
+            pattern, mark = noise.no_pattern(nu[0]), unmarked
+        times = middle[:1] if noise.is_constant(pattern) else middle
+        curve = jax.vmap(lambda p, lo, at=times: noise.thresholds(p, at, plan.interpolation, lo))
         limits.append(curve(pattern, floor))
         patterns.append(pattern)
         marks.append(mark)

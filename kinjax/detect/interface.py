@@ -94,7 +94,8 @@ class Joints(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Signals by displacement (objects, n), patterns, and constraints by slot (slots, objects); frames both included.
+    """Signals by displacement (objects, n), patterns, and constraints by slot (slots, objects); frames both included. `marks` of
+    templates and `limits` are one a displacement, or one for all where they are the same.
 
     `overflow`: elements of the fullest object; where it exceeds `Plan.capacity` the run must be repeated with more.
     """
@@ -105,8 +106,8 @@ class Found(NamedTuple):
     eps_1: Float[Array, "objects n"]
     valid: Bool[Array, "objects n"]
     passed: Int[Array, "objects n"]
-    marks: tuple[Int[Array, "objects n"], ...]
-    limits: tuple[tuple[Float[Array, "objects n"], Float[Array, "objects n"]], ...]
+    marks: tuple[Int[Array, "objects #n"], ...]
+    limits: tuple[tuple[Float[Array, "objects #n"], Float[Array, "objects #n"]], ...]
     patterns: tuple[Pattern, ...]
     noise: tuple[Float[Array, " objects"], Float[Array, " objects"]]
     pivot_noise: Float[Array, " objects"]

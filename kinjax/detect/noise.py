@@ -176,13 +176,18 @@ def thresholds(
 
     Without control points the floor alone.
     """
-    if pattern.frames.shape[0] <= 2:  # one template: its two points carry one value
+    if is_constant(pattern):
         curves = [jnp.broadcast_to(v[0], middle.shape) for v in (pattern.sigma, pattern.eps)]
     else:
         curve = {"cubic": natural_cubic, "monotone": monotone_cubic}[interpolation]
         curves = [curve(middle, pattern.frames, v, pattern.size) for v in (pattern.sigma, pattern.eps)]
     some = pattern.size > 0
     return tuple(jnp.where(some, jnp.maximum(c, f), f) for c, f in zip(curves, floor, strict=True))  # type: ignore[return-value]
+
+
+def is_constant(pattern: Pattern) -> bool:
+    """Whether its thresholds do not change in time: one template's two control points carry one value."""
+    return pattern.frames.shape[-1] <= 2
 
 
 def no_pattern(like: Float[Array, " objects"]) -> Pattern:

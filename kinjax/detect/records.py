@@ -88,10 +88,12 @@ def detection(
     )
     kinds: tuple[Any, ...] = kinds_of(plan)[: len(host.limits)]
     middle = (np.arange(n) + (0.5 if settings.method == "paper" else plan.span / 2)) * scale
-    template = np.zeros((objects, n), int)
-    if templates:
-        for m in host.marks:
-            np.maximum(template, m[:objects, :n], out=template)
+    template = np.broadcast_to(np.zeros((), int), (n, objects))
+    for m in host.marks if templates else ():
+        template = np.maximum(template, cut(m))
+    limits: list[dict[Any, np.ndarray]] = [
+        {k: np.broadcast_to(cut(pair[i]), template.shape) for k, pair in zip(kinds, host.limits, strict=True)} for i in (0, 1)
+    ]
     absent = clip.frames - np.count_nonzero(clip.valid, axis=1)
     return Detection(
         middle,
@@ -101,9 +103,9 @@ def detection(
         cut(host.eps_1),
         cut(host.valid),
         cut(host.passed),
-        template.T,
-        {k: cut(v[0]) for k, v in zip(kinds, host.limits, strict=True)},
-        {k: cut(v[1]) for k, v in zip(kinds, host.limits, strict=True)},
+        template,
+        limits[0],  # type: ignore[arg-type]
+        limits[1],  # type: ignore[arg-type]
         absent + host.missing[:objects],
         np.stack([x[:objects] for x in host.noise], axis=-1),
         segments,

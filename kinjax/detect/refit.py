@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..numerics import (
     CHUNK,
+    bits_between,
     counted,
     counts_at,
     in_chunks,
@@ -27,6 +28,7 @@ from ..numerics import (
     safe_divide,
     safe_norm,
     safe_sqrt,
+    unpacked_bits,
 )
 from ..rotations import apply, apply_transposed, dot, matrix
 
@@ -116,33 +118,40 @@ def span_places(
 ) -> Place:
     """Refit of space constraints: running sums are enough, and no frame is gathered. Spans as for `span_moments`.
 
-    Each frame's origin is a running sum of the steps from one span's first place to the next one's.
+    Each frame's origin is a running sum of the steps from one span's first place to the next one's; which frames are inside one,
+    and how many of them were seen, are questions of bits.
     """
     objects, frames = valid.shape
     slots, nothing = begin.shape[0], jnp.zeros((objects, frames), t.dtype)
+    seen = packed_bits(valid)
+    none = jnp.zeros_like(seen)
     begins, ends = jnp.where(used, begin, 0), jnp.where(used, end, 0)
     before = jnp.concatenate([begins[:1], begins])[:slots]  # where the span before begins
     count = jnp.max(jnp.sum(used, axis=0, dtype=jnp.int32), initial=0)
-    lane = jnp.broadcast_to(jnp.arange(objects, dtype=jnp.int32), (CHUNK, objects))
+    lane, one = jnp.broadcast_to(jnp.arange(objects, dtype=jnp.int32), (CHUNK, objects)), jnp.uint32(1)
     rows = lambda x, first: jax.lax.dynamic_slice_in_dim(x, first, CHUNK, 0)  # noqa: E731
 
     def mark(carried: tuple[Array, ...], at: Int[Array, ""]) -> tuple[tuple[Array, ...], None]:
-        marks, *steps = carried
+        begun, ended, *steps = carried
         here, earlier, real = rows(begins, at), rows(before, at), rows(used, at)
-        first, last = jnp.where(real, here, frames), jnp.where(real, rows(ends, at), frames)
-        marks = marks.at[lane, first].add(1, mode="drop").at[lane, last].add(-1, mode="drop")
+        first, until = jnp.where(real, here, frames), rows(ends, at)
+        some = until > here  # of these no two begin, or end, at one frame: bits can be added
+        begun, ended = (
+            bits.at[lane, jnp.where(some, x // 32, seen.shape[-1])].add(one << (x % 32).astype(jnp.uint32), mode="drop")
+            for bits, x in ((begun, here), (ended, until))
+        )
         is_first = (at + jnp.arange(CHUNK, dtype=jnp.int32) == 0)[:, None]
         for i, x in enumerate(t):
             step = jnp.where(real, _at(x, here).T - jnp.where(is_first, 0, _at(x, earlier).T), 0)
             steps[i] = steps[i].at[lane, first].add(step, mode="drop")
-        return (marks, *steps), None
+        return (begun, ended, *steps), None
 
-    (marks, *steps), _ = in_chunks(mark, (nothing,) * 4, slots, count)
-    inside = valid & (running_sum(marks) > 0.5)
+    (begun, ended, *steps), _ = in_chunks(mark, (none, none, nothing, nothing, nothing), slots, count)
+    inside = unpacked_bits(seen & bits_between(begun ^ ended), frames)
     path = [running_sum(s) for s in steps]
     d = [x - y for x, y in zip(t, path, strict=True)]
     sums = [running_sum_at(jnp.where(inside, x, 0)) for x in (*d, dot(d, d))]
-    seen = counted(packed_bits(valid))
+    seen_until = counted(seen)
 
     def place(state: None, at: Int[Array, ""]) -> tuple[None, tuple[Array, ...]]:
         first, last, real = rows(begins, at), rows(ends, at), rows(used, at)
@@ -157,7 +166,7 @@ def span_places(
             return between + jnp.where(with_last, ending, 0)
 
         *moments, square = (total(x, y) for x, y in zip(sums, ending, strict=True))
-        number = counts_at(seen, last.T) - jnp.where(after_first.T, counts_at(seen, earlier), 0)
+        number = counts_at(seen_until, last.T) - jnp.where(after_first.T, counts_at(seen_until, earlier), 0)
         n = jnp.maximum(number.T.astype(t.dtype), 1)
         center = [x / n for x in moments]
         spread = safe_sqrt(jnp.maximum(square / n - dot(center, center), 0))
