@@ -87,12 +87,9 @@ class Skeleton:
         origin it is mostly the lever (2006 paper, appendix A).
         """
         offsets, ends = np.asarray(self.offsets), np.asarray(self.end_offsets)
-        total, count = np.zeros_like(offsets), np.zeros((len(offsets), 1))
-        for i, p in enumerate(self.topology.parents):
-            if p >= 0:
-                total[p] += offsets[i]
-                count[p] += 1
-        for i, p in enumerate(self.topology.end_parents):
-            total[p] += ends[i]
-            count[p] += 1
+        parents = np.array([*self.topology.parents, *self.topology.end_parents], int)
+        children, below = parents >= 0, np.concatenate([offsets, ends])
+        total = np.zeros_like(offsets)
+        np.add.at(total, parents[children], below[children])
+        count = np.bincount(parents[children], minlength=len(offsets))[:, None]
         return 0.5 * total / np.maximum(count, 1)
