@@ -111,7 +111,7 @@ def test_costs_are_split_and_counted(data: Path, monkeypatch):
     assert len(found.constraints) == 3 * 3 + 2 * 2
     signals, limits = jax.eval_shape(lambda: costs._until(plan, "pattern", *arguments))
     assert jax.eval_shape(lambda: costs._until(plan, "projection", *arguments)) == signals
-    assert [x.shape for pair in limits for x in pair] == [signals[0].shape] * 2
+    assert [x.shape for pair in limits for x in pair] == [(signals[0].shape[0], 1)] * 2  # one template: one value an object
     monkeypatch.setattr(costs, "_until", lambda plan, stop, *rest: costs.run_poses(plan, *rest))  # nothing to compile
     c = costs.cost(poses, templates, ROBUST.settings, rounds=2)
     assert c.found == 13
