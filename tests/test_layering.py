@@ -14,8 +14,8 @@ HEAVY = ("jax", "jaxlib", "numpy", "scipy", "matplotlib", "pyarrow", "duckdb", "
 
 # From the foundations to what touches disk, argv and browsers. A name is a module, or a folder and all in it.
 ORDER = (
-    "errors", "marker_sets", "lengths", "memory", "numerics", "components", "rotations", "quaternions", "forward", "splines", "annotations",
-    "skeleton", "joint_names", "anthropometry", "motion", "kinematics",
+    "errors", "marker_sets", "lengths", "memory", "numerics", "bits", "components", "rotations", "quaternions", "forward", "splines",
+    "annotations", "skeleton", "joint_names", "anthropometry", "motion", "kinematics",
     "synthetic", "detect", "deform", "soft", "evaluation", "formats", "database", "plots", "report", "studio", "cli",
 )  # fmt: skip
 # Inside detect/, deform/ and cli/, the same; in detect/ a file that is not named here gathers the others.

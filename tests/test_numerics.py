@@ -11,22 +11,14 @@ from hypothesis import strategies as st
 from benchmarks import reliability
 from kinjax.lengths import BLOCK, bucket
 from kinjax.numerics import (
-    bits_after,
-    bits_before,
-    bits_between,
-    counted,
-    counts_at,
     eps_of,
     order_statistic,
-    packed_bits,
     running_count,
     running_sum,
     running_sum_at,
     safe_divide,
     safe_norm,
     safe_sqrt,
-    true_positions,
-    unpacked_bits,
 )
 
 ROWS = ("N8", "N9", "N11")
@@ -172,18 +164,6 @@ def test_running_count_of_a_long_clip():
     np.testing.assert_array_equal(jax.jit(running_count)(jnp.ones(n, bool)), np.arange(1, n + 1))
 
 
-@pytest.mark.parametrize("n", [1, 31, 64, 300])
-def test_true_positions(n):
-    flags = np.random.default_rng(n).random((6, n)) < np.array([0, 0.02, 0.2, 0.5, 0.9, 1])[:, None]
-    find = jax.jit(lambda f: true_positions(counted(packed_bits(f)), 40))
-    found, total = find(jnp.asarray(flags))
-    np.testing.assert_array_equal(total, flags.sum(1))
-    for row, f in zip(np.asarray(found), flags, strict=True):
-        at = np.flatnonzero(f)[:40]
-        np.testing.assert_array_equal(row[: len(at)], at)
-        assert (row[len(at) :] >= n).all()
-
-
 def test_running_sum(precision):
     x = np.random.default_rng(2).normal(size=(2, 3, 301)).astype(precision)
     np.testing.assert_allclose(running_sum(jnp.asarray(x)), np.cumsum(x, -1), atol=200 * np.finfo(precision).eps)
@@ -199,12 +179,6 @@ def test_running_sum_at_a_few_places(n, precision):
     np.testing.assert_allclose(found, expected, atol=200 * np.finfo(precision).eps)
 
 
-def test_flags_are_counted_exactly_in_long_clips():
-    n = 2**22
-    flags = counted(packed_bits(jnp.ones((1, n), bool)))
-    np.testing.assert_array_equal(flags.until[0], np.arange(32, n + 1, 32))
-
-
 def test_buckets_are_monotone_few_and_little_padded():
     sizes = [bucket(n) for n in range(1, 20001)]
     assert all(s >= n for n, s in enumerate(sizes, 1))
@@ -214,32 +188,3 @@ def test_buckets_are_monotone_few_and_little_padded():
     assert max(s - n for n, s in enumerate(sizes, 1) if 64 <= n <= 128) < BLOCK
     assert len(set(sizes)) <= 4 * 9 + 1  # of 64..20,000: at most four an octave
     assert all(bucket(s) == s and s % BLOCK == 0 for s in set(sizes))
-
-
-@pytest.mark.parametrize("n", [32, 64, 77, 320])
-def test_packed_bits_find_and_count_flags(n):
-    rng = np.random.default_rng(n)
-    flags = rng.random((4, n)) < np.array([[0.0], [0.1], [0.6], [1.0]])
-    words = packed_bits(jnp.asarray(flags))
-    found, total = true_positions(counted(words), n)
-    for lane in range(4):
-        at = np.flatnonzero(flags[lane])
-        assert total[lane] == len(at)
-        np.testing.assert_array_equal(found[lane][: len(at)], at)
-        assert (np.asarray(found[lane][len(at) :]) >= n).all()
-    index = rng.integers(0, n, (4, 50))
-    expected = np.take_along_axis(np.cumsum(flags, axis=1), index, axis=1)
-    np.testing.assert_array_equal(counts_at(counted(words), jnp.asarray(index, jnp.int32)), expected)
-    earlier, later = np.zeros_like(flags), np.zeros_like(flags)
-    earlier[:, 1:], later[:, :-1] = flags[:, :-1], flags[:, 1:]
-    whole = n // 32  # the last word may hold one shifted flag more
-    for shifted, expected in ((bits_before(words), earlier), (bits_after(words), later)):
-        np.testing.assert_array_equal(shifted[:, :whole], packed_bits(jnp.asarray(expected))[:, :whole])
-
-
-@pytest.mark.parametrize("n", [1, 32, 77, 320])
-def test_bits_between_switches(n):
-    switches = np.random.default_rng(n).random((5, n)) < np.array([[0], [0.05], [0.3], [0.9], [1]])
-    words = packed_bits(jnp.asarray(switches))
-    np.testing.assert_array_equal(unpacked_bits(words, n), switches)
-    np.testing.assert_array_equal(unpacked_bits(bits_between(words), n), np.cumsum(switches, axis=1) % 2 == 1)

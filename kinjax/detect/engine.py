@@ -14,9 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..bits import packed_bits
 from ..forward import world_transforms
 from ..lengths import BLOCK
-from ..numerics import computed_once, packed_bits
+from ..numerics import computed_once
 from ..rotations import cross, normalize, rotate
 from . import noise
 from .bounds import bounds

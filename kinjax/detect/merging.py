@@ -14,19 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..numerics import (
-    CHUNK,
-    Bits,
-    bits_after,
-    bits_before,
-    counted,
-    counts_at,
-    in_chunks,
-    packed_bits,
-    safe_divide,
-    safe_norm,
-    true_positions,
-)
+from ..bits import Bits, bits_after, bits_before, counted, counts_at, packed_bits, true_positions
+from ..numerics import CHUNK, in_chunks, safe_divide, safe_norm
 from ..rotations import cross, dot
 from .instantaneous import LINE, NONE, POINT, SPACE
 

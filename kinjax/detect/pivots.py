@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..numerics import packed_bits, safe_sqrt
+from ..bits import packed_bits
+from ..numerics import safe_sqrt
 from ..rotations import dot
 from .instantaneous import LINE, NONE, POINT, SPACE
 from .merging import Spans, elements, packed

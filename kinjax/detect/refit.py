@@ -15,21 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..numerics import (
-    CHUNK,
-    bits_between,
-    counted,
-    counts_at,
-    in_chunks,
-    packed_bits,
-    running_count,
-    running_sum,
-    running_sum_at,
-    safe_divide,
-    safe_norm,
-    safe_sqrt,
-    unpacked_bits,
-)
+from ..bits import bits_between, counted, counts_at, packed_bits, unpacked_bits
+from ..numerics import CHUNK, in_chunks, running_count, running_sum, running_sum_at, safe_divide, safe_norm, safe_sqrt
 from ..rotations import apply, apply_transposed, dot, matrix
 
 
