@@ -1,6 +1,6 @@
 """Flags of a clip's frames packed 32 to a word: what looks at their runs reads a thirty-second of the memory.
 
-In: flags by lane and frame. Out: words, and from them neighbours, runs between switches, places and counts of true flags.
+In: flags by lane and frame. Out: words, and from them neighbours, places and counts of true flags.
 """
 
 from __future__ import annotations
@@ -42,22 +42,6 @@ def bits_after(words: Bits) -> Bits:
     """Each flag's successor (False after the last)."""
     below = jnp.concatenate([words[:, 1:], jnp.zeros_like(words[:, :1])], axis=1)
     return (words >> jnp.uint32(1)) | (below << jnp.uint32(31))
-
-
-def bits_between(switches: Bits) -> Bits:
-    """True from every second switch on: from the first (included) to the second, from the third to the fourth, ..."""
-    x = switches
-    for k in (1, 2, 4, 8, 16):
-        x = x ^ (x << jnp.uint32(k))
-    odd = (x >> jnp.uint32(31)).astype(jnp.int32)
-    on = (jnp.cumsum(odd, axis=-1, dtype=jnp.int32) - odd) % 2
-    return x ^ -on.astype(jnp.uint32)
-
-
-def unpacked_bits(words: Bits, n: int) -> Bool[Array, "lanes n"]:
-    """The first `n` flags."""
-    flags = (words[..., None] >> jnp.arange(32, dtype=jnp.uint32)) & jnp.uint32(1)
-    return flags.reshape(words.shape[0], -1)[:, :n] > 0
 
 
 class Flags(NamedTuple):

@@ -96,32 +96,16 @@ def shifted(x: Array, s: int, fill: float | bool = 0) -> Array:
     return jnp.concatenate([x[..., s:], pad] if s > 0 else [pad, x[..., :s]], axis=-1)
 
 
-def _blocks(x: Float[Array, "... n"]) -> tuple[Float[Array, "... blocks size"], Float[Array, "... blocks"]]:
-    """Inclusive running sums inside blocks, and the sum before each block: a product with a triangle of ones, and a short
-    scan over blocks (XLA's own cumulative sum takes a pass for every power of two)."""
+def running_sum(x: Float[Array, "... n"]) -> Float[Array, "... n"]:
+    """Inclusive running sum along the last axis: inside blocks by a product with a triangle of ones, and a short scan over blocks
+    (XLA's own cumulative sum takes a pass for every power of two)."""
     n = x.shape[-1]
     whole = x if n % BLOCK == 0 else jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, -n % BLOCK)])
     blocks = whole.reshape(*x.shape[:-1], -1, BLOCK)
     inside = jnp.matmul(blocks, jnp.triu(jnp.ones((BLOCK, BLOCK), x.dtype)), precision="highest")
     total = inside[..., -1]
-    return inside, jnp.cumsum(total, axis=-1) - total
-
-
-def running_sum(x: Float[Array, "... n"]) -> Float[Array, "... n"]:
-    """Inclusive running sum along the last axis."""
-    inside, before = _blocks(x)
-    return (inside + before[..., None]).reshape(*x.shape[:-1], -1)[..., : x.shape[-1]]
-
-
-def running_sum_at(x: Float[Array, "lanes n"]) -> Callable[[Int[Array, "lanes k"]], Float[Array, "lanes k"]]:
-    """The inclusive running sums, to be looked up at a few places: without a pass that adds up what blocks begin with."""
-    inside, before = _blocks(x)
-    inside = inside.reshape(*x.shape[:-1], -1)
-
-    def at(index: Int[Array, "lanes k"]) -> Float[Array, "lanes k"]:
-        return jnp.take_along_axis(inside, index, axis=-1) + jnp.take_along_axis(before, index // BLOCK, axis=-1)
-
-    return at
+    before = jnp.cumsum(total, axis=-1) - total
+    return (inside + before[..., None]).reshape(*x.shape[:-1], -1)[..., :n]
 
 
 def running_count(flags: Bool[Array, "... n"]) -> Int[Array, "... n"]:
@@ -144,6 +128,11 @@ def computed_once(x: Any, never: Bool[Array, ""]) -> Any:
         return jax.tree.map(lambda y: jnp.roll(y, 1), carried[0]), carried[1]
 
     return jax.lax.while_loop(lambda carried: carried[1], again, (x, never))[0]
+
+
+def at_frames(x: Array, index: Int[Array, "k lanes"]) -> Array:
+    """`x` (lanes, n) at each lane's own places, of which all are inside: (k, lanes)."""
+    return jnp.take_along_axis(x, index.T, axis=-1, mode="promise_in_bounds").T
 
 
 CHUNK = 32

@@ -8,12 +8,10 @@ import pytest
 from kinjax.bits import (
     bits_after,
     bits_before,
-    bits_between,
     counted,
     counts_at,
     packed_bits,
     true_positions,
-    unpacked_bits,
 )
 
 
@@ -54,11 +52,3 @@ def test_packed_bits_find_and_count_flags(n):
     whole = n // 32  # the last word may hold one shifted flag more
     for shifted, expected in ((bits_before(words), earlier), (bits_after(words), later)):
         np.testing.assert_array_equal(shifted[:, :whole], packed_bits(jnp.asarray(expected))[:, :whole])
-
-
-@pytest.mark.parametrize("n", [1, 32, 77, 320])
-def test_bits_between_switches(n):
-    switches = np.random.default_rng(n).random((5, n)) < np.array([[0], [0.05], [0.3], [0.9], [1]])
-    words = packed_bits(jnp.asarray(switches))
-    np.testing.assert_array_equal(unpacked_bits(words, n), switches)
-    np.testing.assert_array_equal(unpacked_bits(bits_between(words), n), np.cumsum(switches, axis=1) % 2 == 1)

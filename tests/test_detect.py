@@ -9,7 +9,8 @@ import pytest
 from benchmarks.speed import walking_crowd
 from kinjax import synthetic
 from kinjax.annotations import Template
-from kinjax.detect import Settings, calibrate, detect, detect_many
+from kinjax.detect import Settings, calibrate, detect, detect_many, engine, pipeline
+from kinjax.detect.planning import numbers, pivot_patterns
 from kinjax.detect.prepare import prepared
 from kinjax.detect.refit import span_places
 from kinjax.errors import OptionError, ShapeError, TemplateError, TemplateTooShort, UnknownNameError
@@ -41,6 +42,23 @@ def test_motion_and_its_poses_give_the_same(walk):
         np.testing.assert_allclose(x.position, y.position, atol=2e-5)
 
 
+@pytest.mark.parametrize("options", [{"method": "paper", "thresholds": (2e-3, 2e-3)}, {}, {"types": ("space", "line")}])
+def test_few_objects_at_a_time_are_the_same_as_all_at_once(options, monkeypatch):
+    motion = walking_crowd(300, 5)
+    settings = Settings().but(**{"types": ("space",)} | options)
+    clip = prepared(motion, None, None, settings)
+    plan = pipeline._run(clip, settings, (), ())[0]
+    found = []
+    for width in (8, 2, 1):
+        monkeypatch.setattr(engine, "CACHED", width * clip.arrays.valid.shape[-1])
+        run = jax.jit(lambda numbers, joints, plan=plan: engine.run_joints.__wrapped__(plan, numbers, joints, (), ()))
+        found.append(jax.tree.leaves(run(numbers(settings, clip.rate, pivot_patterns((), clip)), clip.arrays)))
+    for other in found[1:]:
+        for a, b in zip(found[0], other, strict=True):
+            close = {"rtol": 1e-6, "atol": 1e-6} if jax.numpy.issubdtype(a.dtype, jax.numpy.floating) else {"rtol": 0}
+            np.testing.assert_allclose(a, b, **close)
+
+
 def test_names_in_any_case_and_order(walk):
     a = detect(walk.motion, ["rightfoot", "LEFTFOOT", "RightFoot"])
     assert a.objects == ("RightFoot", "LeftFoot")
@@ -57,6 +75,7 @@ def test_joints_in_their_order_are_the_same_in_any_other(method):
     assert prepared(motion, None, None, Settings()).arrays.at is None
     assert b.objects == tuple(reversed(a.objects))
     np.testing.assert_array_equal(a.sigma_3, b.sigma_3[:, ::-1])
+    assert a.sigma_1.shape == a.eps_1.shape == a.valid.shape == a.sigma_3.shape
     found = [{(c.object, c.type, c.begin, c.end, *c.position) for c in d.constraints} for d in (a, b)]
     assert found[0] == found[1] and found[0]
 
@@ -337,16 +356,17 @@ def test_window_refuses_patterns_that_it_would_not_use(walk):
 
 
 def test_places_of_spans_by_plain_means():
-    """More spans than a chunk holds, that share end frames, are one frame long, a metre apart, or lie where frames are missing."""
+    """More spans than a chunk holds, that share end frames, are one frame or a hundred long, a metre apart, or lie where frames
+    are missing."""
     rng = np.random.default_rng(4)
-    frames, objects, slots = 640, 3, 64
+    frames, objects, slots = 640, 4, 64
     begin, end = np.zeros((slots, objects), np.int32), np.zeros((slots, objects), np.int32)
     used = np.zeros((slots, objects), bool)
     t = rng.normal(size=(3, objects, frames)) * 1e-4
-    for lane, most in enumerate((40, 7, 0)):
+    for lane, (most, lengths) in enumerate(((40, (0, 1, 5, 12)), (7, (0, 1, 5, 12)), (0, ()), (6, (8, 16, 31, 150)))):
         at, gap, where = 0, 1, 0.0
         for k in range(most):
-            long = int(rng.choice([0, 1, 5, 12]))
+            long = int(rng.choice(lengths))
             begin[k, lane], end[k, lane], used[k, lane] = at, at + long, True
             where = rng.normal(size=(3, 1)) if gap else where  # a frame of two rests is where both are
             t[:, lane, at + (gap == 0) : at + long + 1] += where

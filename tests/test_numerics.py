@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from benchmarks import reliability
 from kinjax.lengths import BLOCK, bucket
 from kinjax.numerics import (
+    at_frames,
     eps_of,
     order_statistic,
     running_count,
     running_sum,
-    running_sum_at,
     safe_divide,
     safe_norm,
     safe_sqrt,
@@ -170,13 +170,11 @@ def test_running_sum(precision):
     assert running_sum(jnp.zeros((2, 0), precision)).shape == (2, 0)
 
 
-@pytest.mark.parametrize("n", [1, 32, 301])
-def test_running_sum_at_a_few_places(n, precision):
-    rng = np.random.default_rng(n)
-    x, index = rng.normal(size=(3, n)).astype(precision), rng.integers(0, n, (3, 40))
-    found = running_sum_at(jnp.asarray(x))(jnp.asarray(index, jnp.int32))
-    expected = np.take_along_axis(np.cumsum(x, -1), index, -1)
-    np.testing.assert_allclose(found, expected, atol=200 * np.finfo(precision).eps)
+def test_values_at_places_of_each_lane():
+    rng = np.random.default_rng(1)
+    x, index = rng.normal(size=(3, 50)), rng.integers(0, 50, (7, 3))
+    found = at_frames(jnp.asarray(x, jnp.float32), jnp.asarray(index, jnp.int32))
+    np.testing.assert_array_equal(found, np.take_along_axis(np.float32(x), index.T, axis=1).T)
 
 
 def test_buckets_are_monotone_few_and_little_padded():

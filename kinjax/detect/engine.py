@@ -8,23 +8,26 @@ nothing but `Numbers`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..bits import packed_bits
+from ..components import Parts, rotate
 from ..forward import world_transforms
 from ..lengths import BLOCK
-from ..numerics import computed_once
-from ..rotations import cross, normalize, rotate
+from ..numerics import at_frames, computed_once
+from ..rotations import cross, normalize
 from . import noise
 from .bounds import bounds
 from .displacements import Displacement, displacements, mean_pose, spikes
 from .instantaneous import LINE, NONE, POINT, SPACE, instantaneous
 from .interface import Clip, Found, Joints, Numbers, Plan, TemplateSpans
-from .merging import Spans, absorb_short_rests, elements, merge, runs
+from .merging import Runs, Spans, Where, absorb_short_rests, elements, merge, runs
 from .noise import Pattern
 from .pivots import merged_pivots, template_noise
 from .refit import fit, span_moments, span_places
@@ -36,24 +39,63 @@ REST_NOISE = 0.003
 """Metres: the least noise that a rest is measured against (window method)."""
 
 
-def run(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, given: tuple[Pattern, ...]) -> Found:
-    """Steps 1 to 6."""
+class Observed(NamedTuple):
+    """Steps 1 to 5 of some objects, which are the first axis of everything; vectors as tuples of components.
+
+    The engine's own poses, normalised and with what is not `valid` at rest in the origin; `smooth` ones (None: the same);
+    sigma_3, eps_3, sigma_1, eps_1 of all displacements (`values`; one for all where they are the same), which of them are `shown` by
+    valid frames and have `passed`, and, where lines are merged, their points and axes; patterns; noise `nu`.
+    """
+
+    q: Parts
+    t: Parts
+    valid: Array
+    smooth: tuple[Parts, Parts] | None
+    values: tuple[Array, Array, Array, Array]
+    shown: Array
+    passed: Array
+    lines: tuple[Parts, Parts] | None
+    patterns: tuple[Pattern, ...]
+    marks: tuple[Array, ...]
+    limits: tuple[tuple[Array, Array], ...]
+    nu: tuple[Array, Array]
+    missing: Array
+
+
+PosesOf = Callable[[Any, int], tuple[Parts, Parts, Array]]
+"""World quaternions and positions, by component, and which are seen, of so many objects from one on."""
+
+CACHED = 1 << 14
+"""Numbers of an array for which that and its likes stay in a core's second cache."""
+
+
+def _width(lanes: int, frames: int) -> int:
+    """Objects to look at together: `lanes` is a power of two."""
+    while lanes > 1 and lanes * frames > CACHED:
+        lanes //= 2
+    return lanes
+
+
+def observed(
+    plan: Plan, numbers: Numbers, q: Parts, t: Parts, seen: Array, templates: TemplateSpans, given: tuple[Pattern, ...]
+) -> Observed:
+    """Steps 1 to 5, object by object: nothing of one reaches another."""
     paper = plan.method == "paper"
-    q, t, seen = clip
     # component by component, here and in what follows: XLA does not vectorise a loop over a stack of them
     turned = [jnp.where(seen, x, 0 if i else 1) for i, x in enumerate(normalize(q))]
     moved = [jnp.where(seen, x, 0) for x in t]
     never = numbers.rate < 0
     turned, moved, seen = computed_once((turned, moved, seen), never)
-    q, t = jnp.stack(turned), jnp.stack(moved)
-    valid = seen if paper else computed_once(seen & ~spikes(q, t, seen, plan.hampel, numbers.spike, never), never)
-    clip = Clip(q, t, valid)
-    smooth = clip if paper else Clip(*mean_pose(q, t, valid, plan.mean, never), valid)
-    real = t.shape[-1] - BLOCK + 3  # without padding, and three frames more: as many third differences as there are in whole blocks
-    nu = (jnp.zeros_like(t[0, :, 0]),) * 2 if paper else noise.data_noise(*(x[..., :real] for x in (q, t, valid)))
+    clip = Clip(jnp.stack(turned), jnp.stack(moved), seen)
+    if not paper:
+        spiky = spikes(*clip, plan.hampel, numbers.spike, never)
+        clip = clip._replace(valid=computed_once(seen & ~spiky, never))
+    smooth = clip if paper else Clip(*mean_pose(*clip, plan.mean, never), clip.valid)
+    real = seen.shape[-1] - BLOCK + 3  # without padding, and three frames more: as many third differences as there are in whole blocks
+    nu = (jnp.zeros_like(clip.t[0, :, 0]),) * 2 if paper else noise.data_noise(*(x[..., :real] for x in clip))
     x = displacements(*smooth, plan.span)
     if paper and plan.span > 1:  # interval i belongs to frames i and i + 1, however far the displacement reaches
-        x = x._replace(valid=x.valid & valid[:, 1 : 1 - plan.span])
+        x = x._replace(valid=x.valid & clip.valid[:, 1 : 1 - plan.span])
     n = (x.w.shape[-1] // BLOCK) * BLOCK  # `prepare` pads by a block, so what is cut off is padding
     x = Displacement(*(a[..., :n] for a in x))
     points = _project(plan, numbers, x, smooth)
@@ -68,11 +110,54 @@ def run(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, give
         limits[-1] if paper and plan.lines else None,
         numbers.axis_min,
     )
-    points, passed = computed_once((points, passed), never)
+    # in closed form sigma_1 is 0 throughout
+    sigma_1 = points.sigma_1[:, :1] if plan.projection == "closed" else points.sigma_1
+    values = points.sigma_3, points.eps_3, sigma_1, points.eps_1
+    lines = (tuple(points.point), tuple(points.axis)) if paper and plan.lines else None
+    values, passed, lines = computed_once((values, passed, lines), never)
+    return Observed(
+        tuple(turned),
+        tuple(moved),
+        clip.valid,
+        None if paper else (tuple(smooth.q), tuple(smooth.t)),
+        values,
+        x.valid,
+        passed,
+        lines,
+        patterns,
+        marks,
+        limits,
+        nu,
+        jnp.sum(seen & ~clip.valid, axis=-1, dtype=jnp.int32),
+    )
+
+
+def run(
+    plan: Plan,
+    numbers: Numbers,
+    poses: PosesOf,
+    shape: tuple[int, ...],
+    templates: TemplateSpans,
+    given: tuple[Pattern, ...],
+) -> Found:
+    """Steps 1 to 6; `shape`: objects and frames. Up to the fifth a few objects at a time, so that what one step leaves for the
+    next is in cache."""
+    paper, (lanes, frames) = plan.method == "paper", shape
+    width = _width(lanes, frames)
+
+    def some(first: Array) -> Observed:
+        mine = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, width, 0), (templates, given))
+        return observed(plan, numbers, *poses(first, width), *mine)
+
+    firsts = jnp.arange(0, lanes, width, dtype=jnp.int32)
+    o = jax.tree.map(lambda x: x.reshape(lanes, *x.shape[2:]), jax.lax.map(some, firsts))
+    never, nu = numbers.rate < 0, o.nu
+    clip = Clip(jnp.stack(o.q), jnp.stack(o.t), o.valid)
+    smooth = clip if o.smooth is None else Clip(jnp.stack(o.smooth[0]), jnp.stack(o.smooth[1]), o.valid)
     if plan.method == "window":
         total, spans = _rest_windows(plan, numbers, clip, nu, templates)
     else:
-        total, spans = _merge(plan, numbers, passed, x.valid, points, smooth)
+        total, spans = _merge(plan, numbers, o.passed, o.shown, o.lines, smooth)
     if not paper:
         wide = 0 if plan.method == "window" else plan.span
         settled = settle(spans, Poses(*clip), Poses(*smooth), nu, wide, plan.mean + (plan.span + 1) // 2)
@@ -103,19 +188,20 @@ def run(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, give
         found = tuple(jnp.concatenate([a, b], axis=a.ndim - 2) for a, b in zip(found, pivots, strict=True))
     kind, begin, end, position, axis, residual = found
     asked = ((kind == SPACE) & plan.types[0]) | ((kind == LINE) & plan.types[1]) | ((kind == POINT) & plan.types[2])
+    sigma_3, eps_3, sigma_1, eps_1 = o.values
     return Found(
-        points.sigma_3,
-        points.eps_3,
-        points.sigma_1,
-        points.eps_1,
-        x.valid,
-        passed,
-        marks,
-        limits,
-        patterns,
+        sigma_3,
+        eps_3,
+        sigma_1,
+        eps_1,
+        o.shown,
+        o.passed,
+        o.marks,
+        o.limits,
+        o.patterns,
         nu,
         pivot_noise,
-        jnp.zeros(seen.shape[:1], jnp.int32) if paper else jnp.sum(seen & ~valid, axis=-1, dtype=jnp.int32),
+        o.missing,
         jnp.where(asked & (end - begin >= numbers.least), kind, NONE),
         begin,
         end,
@@ -186,25 +272,32 @@ def _thresholds(
 
 
 def _merge(
-    plan: Plan, numbers: Numbers, kind: Array, valid: Array, points: SigmaEpsilon, poses: Clip
+    plan: Plan, numbers: Numbers, kind: Array, valid: Array, lines: tuple[Parts, Parts] | None, poses: Clip
 ) -> tuple[Array, Spans]:
     """How many elements each object has, and step 6 on displacements; the spans that come out are frames, both included."""
-    n = kind.shape[-1]
-    lines = plan.method == "paper" and plan.lines
     low, high = (0, 1) if plan.method == "paper" else (plan.span // 2, (plan.span + 1) // 2)
-    start, stop = poses.t[..., :n], poses.t[..., plan.span : plan.span + n]
-    if plan.method == "paper":
-        stop = poses.t[..., 1 : n + 1]
-    else:  # a displacement's ends were seen, its middle frames perhaps not
-        start = stop = (start + stop) / 2
-    missing = ~valid
-    if lines:
+    seen = countable = packed_bits(valid)
+    if lines is not None:
         kind, absorbed = absorb_short_rests(kind, numbers.least)
-        valid &= ~absorbed
-        on_line = kind == LINE
-        start, stop = jnp.where(on_line, points.point, start), jnp.where(on_line, points.point, stop)
-    find, total = elements(kind, runs(kind), valid, missing, start, stop, points.axis if lines else None)
-    spans = merge(find, total, plan.capacity, numbers.tolerance, lines)
+        countable = seen & ~packed_bits(absorbed)
+
+    def where(after: int) -> Where:
+        """Where the constraints of displacements lie: lines where they were found, rests at the object's place."""
+
+        def at(i: Array) -> tuple[Array, ...]:
+            if plan.method != "paper":  # a displacement's ends were seen, its middle frames perhaps not
+                return tuple((at_frames(x, i) + at_frames(x, i + plan.span)) / 2 for x in poses.t)
+            place = tuple(at_frames(x, i + after) for x in poses.t)
+            if lines is None:
+                return place
+            on_line = at_frames(kind, i) == LINE
+            return tuple(jnp.where(on_line, at_frames(p, i), x) for p, x in zip(lines[0], place, strict=True))
+
+        return at
+
+    axis = (lambda i: tuple(at_frames(x, i) for x in lines[1])) if lines is not None else None
+    find, total = elements(kind, runs(kind, lines is not None), countable, ~seen, where(0), where(1), axis)
+    spans = merge(find, total, plan.capacity, numbers.tolerance, lines is not None)
     return total, Spans(spans.kind, spans.first + low, spans.last + high)
 
 
@@ -233,15 +326,13 @@ def _rest_windows(
     nothing = jnp.zeros_like(clip.valid)
     windows = best_segmentation(window_rewards(*clip, nothing, *plan.rest, reward, rest=True), plan.rest[0])
     kind = jnp.where(windows.inside, SPACE, NONE)
-    smooth = mean_pose(*clip, plan.mean, numbers.rate < 0)[1]
+    smooth, seen = mean_pose(*clip, plan.mean, numbers.rate < 0)[1], packed_bits(clip.valid)
     find, total = elements(
         kind,
-        (packed_bits(windows.is_first), packed_bits(windows.is_last)),
-        clip.valid,
-        ~clip.valid,
-        smooth,
-        smooth,
-        None,
+        Runs(*map(packed_bits, (windows.inside, windows.is_first, windows.is_last))),
+        seen,
+        ~seen,
+        *(lambda i: tuple(at_frames(x, i) for x in smooth),) * 2,
     )
     return total, merge(find, total, plan.capacity, numbers.tolerance, False)
 
@@ -250,7 +341,9 @@ def _refit(plan: Plan, numbers: Numbers, spans: Spans, clip: Clip) -> tuple[Arra
     """Constraints refitted on all their frames: kind, begin, end, position, axis, residual."""
     used = spans.kind != NONE
     if not (plan.method == "paper" and plan.lines):
-        place = span_places(clip.t, clip.valid, spans.first, spans.last, used)
+        # spikes are no places
+        t = clip.t if plan.method == "paper" else jnp.stack([jnp.where(clip.valid, x, 0) for x in clip.t])
+        place = span_places(t, clip.valid, spans.first, spans.last, used)
         return *spans, place.center, jnp.zeros_like(place.center), place.spread
     moments, origin = span_moments(*clip, spans.first, spans.last, used)
     alpha2 = jnp.sin(numbers.tolerance.alpha_max) ** 2
@@ -264,7 +357,7 @@ def _refit(plan: Plan, numbers: Numbers, spans: Spans, clip: Clip) -> tuple[Arra
 @partial(jax.jit, static_argnames="plan")
 def run_poses(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, given: tuple[Pattern, ...]) -> Found:
     """Detection from world poses."""
-    return run(plan, numbers, clip, templates, given)
+    return run(plan, numbers, rows_of(clip), clip.valid.shape, templates, given)
 
 
 @partial(jax.jit, static_argnames="plan")
@@ -272,7 +365,8 @@ def run_joints(
     plan: Plan, numbers: Numbers, joints: Joints, templates: TemplateSpans, given: tuple[Pattern, ...]
 ) -> Found:
     """Detection from joint rotations: forward kinematics first, in the same compiled function."""
-    return run(plan, numbers, joint_poses(joints), templates, given)
+    shape = joints.used.shape[0], joints.valid.shape[0]
+    return run(plan, numbers, joint_poses(joints), shape, templates, given)
 
 
 @partial(jax.jit, static_argnames="plan")
@@ -280,14 +374,37 @@ def run_clips(
     plan: Plan, numbers: Numbers, clips: Joints, templates: TemplateSpans, given: tuple[Pattern, ...]
 ) -> Found:
     """Detection in a batch of clips, whose `Joints` have one more axis in front; their objects come one after another."""
-    q, t, seen = jax.lax.map(joint_poses, clips)  # one by one: each has parents of its own
-    world = (x.reshape(*x.shape[:-3], -1, x.shape[-1]) for x in (jnp.moveaxis(q, 1, 0), jnp.moveaxis(t, 1, 0), seen))
-    return run(plan, numbers, Clip(*world), templates, given)
+
+    def one(x: Joints) -> tuple[Parts, Parts, Array]:
+        return joint_poses(x)(jnp.zeros((), jnp.int32), x.used.shape[0])
+
+    # one by one: each has parents of its own
+    world = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), jax.lax.map(one, clips))
+    return run(plan, numbers, rows_of(Clip(*world)), world[-1].shape, templates, given)
 
 
-def joint_poses(x: Joints) -> Clip:
+def rows_of(world: Clip) -> PosesOf:
+    """Some objects of world poses."""
+
+    def some(first: Array, width: int) -> tuple[Parts, Parts, Array]:
+        return jax.tree.map(
+            lambda x: jax.lax.dynamic_slice_in_dim(x, first, width, 0), (tuple(world.q), tuple(world.t), world.valid)
+        )
+
+    return some
+
+
+def joint_poses(x: Joints) -> PosesOf:
     """World poses of the joints that are objects, origins at their segments' centres."""
     world = world_transforms(x.rotations, x.moving, x.offsets, x.parents, x.translated)
-    q, t = (jnp.stack(x.objects(part)) for part in (world[:4], world[4:]))
-    t = jnp.stack([a + b for a, b in zip(t, rotate(q, x.centers.T[:, :, None]), strict=True)])
-    return Clip(q, t, x.valid & x.used[:, None])
+
+    def some(first: Array, width: int) -> tuple[Parts, Parts, Array]:
+        def rows(y: Array) -> Array:
+            return jax.lax.dynamic_slice_in_dim(y, first, width, 0)
+
+        # rows that are in their order need no gather, which would take a third of what finding them did
+        mine = tuple(rows(w) if x.at is None else w[rows(x.at)] for w in world)
+        turned = rotate(mine[:4], rows(x.centers).T[:, :, None])
+        return mine[:4], tuple(a + b for a, b in zip(mine[4:], turned, strict=True)), x.valid & rows(x.used)[:, None]
+
+    return some

@@ -102,7 +102,7 @@ class Found(NamedTuple):
 
     sigma_3: Float[Array, "objects n"]
     eps_3: Float[Array, "objects n"]
-    sigma_1: Float[Array, "objects n"]
+    sigma_1: Float[Array, "objects #n"]
     eps_1: Float[Array, "objects n"]
     valid: Bool[Array, "objects n"]
     passed: Int[Array, "objects n"]

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..bits import Bits, bits_after, bits_before, counted, counts_at, packed_bits, true_positions
-from ..numerics import CHUNK, in_chunks, safe_divide, safe_norm
+from ..numerics import CHUNK, at_frames, in_chunks, safe_divide, safe_norm
 from ..rotations import cross, dot
 from .instantaneous import LINE, NONE, POINT, SPACE
 
@@ -90,48 +90,59 @@ def absorb_short_rests(
     return jnp.where(absorbed, NONE, kind), absorbed
 
 
-def runs(kind: Int[Array, "objects n"]) -> tuple[Bits, Bits]:
-    """Where elements begin and end: runs of consecutive space displacements, and every single line displacement."""
-    space, line = packed_bits(kind == SPACE), packed_bits(kind == LINE)
-    return (space & ~bits_before(space)) | line, (space & ~bits_after(space)) | line
+class Runs(NamedTuple):
+    """Displacements that carry a constraint, and where elements begin and end."""
+
+    carry: Bits
+    begin: Bits
+    end: Bits
+
+
+def runs(kind: Int[Array, "objects n"], lines: bool) -> Runs:
+    """Runs of consecutive space displacements, and every single line displacement."""
+    space = packed_bits(kind == SPACE)
+    begin, end = space & ~bits_before(space), space & ~bits_after(space)
+    if not lines:
+        return Runs(space, begin, end)
+    line = packed_bits(kind == LINE)
+    return Runs(space | line, begin | line, end | line)
+
+
+Where = Callable[[Int[Array, "k objects"]], tuple[Float[Array, "k objects"], ...]]
+"""The components of a vector at some displacements of each object."""
 
 
 def elements(
     kind: Int[Array, "objects n"],
-    bounds: tuple[Bits, Bits],
-    countable: Bool[Array, "objects n"],
-    missing: Bool[Array, "objects n"],
-    start: Float[Array, "3 objects n"],
-    stop: Float[Array, "3 objects n"],
-    axis: Float[Array, "3 objects n"] | None,
+    runs: Runs,
+    countable: Bits,
+    missing: Bits,
+    start: Where,
+    stop: Where,
+    axis: Where | None = None,
 ) -> tuple[Find, Int[Array, " objects"]]:
-    """What lies between each begin and end of `bounds`, in time order: a function of the first one's number and of how many,
+    """What lies between each begin and end of `runs`, in time order: a function of the first one's number and of how many,
     since fetching all that there is room for costs more than the few that there are; and their number.
 
     countable: displacements that make a gap longer when they carry no constraint. missing: those that were not seen.
     start, stop: where a displacement's constraint lies at its begin and at its end.
     """
     n = kind.shape[-1]
-    begins, ends = (counted(x) for x in bounds)
-    failed, lost = counted(packed_bits(countable & (kind == NONE))), counted(packed_bits(missing))
-
-    def take(x: Array, at: Array) -> Array:
-        return jnp.take_along_axis(x, at, axis=-1).T
-
-    def take3(x: Array, at: Array) -> Array:
-        return jnp.stack([take(row, at) for row in x])
+    begins, ends = counted(runs.begin), counted(runs.end)
+    failed, lost = counted(countable & ~runs.carry), counted(missing)
 
     def find(begin: int | Int[Array, ""], most: int) -> Elements:
         first, _ = true_positions(begins, most, begin)
         last, _ = true_positions(ends, most, begin)
         i, j = jnp.minimum(first, n - 1), jnp.minimum(last, n - 1)
+        begun, ended = jnp.stack(start(i.T)), jnp.stack(stop(j.T))
         return Elements(
-            jnp.where((first < n).T, take(kind, i), NONE),
+            jnp.where((first < n).T, at_frames(kind, i.T), NONE),
             i.T,
             j.T,
-            take3(start, i),
-            take3(stop, j),
-            take3(axis, i) if axis is not None else jnp.zeros((3, *i.T.shape), start.dtype),
+            begun,
+            ended,
+            jnp.zeros_like(begun) if axis is None else jnp.stack(axis(i.T)),
             jnp.stack([counts_at(failed, i).T, counts_at(failed, j).T]),
             jnp.stack([counts_at(lost, i).T, counts_at(lost, j).T]),
         )

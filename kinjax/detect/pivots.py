@@ -16,7 +16,7 @@ from ..bits import packed_bits
 from ..numerics import safe_sqrt
 from ..rotations import dot
 from .instantaneous import LINE, NONE, POINT, SPACE
-from .merging import Spans, elements, packed
+from .merging import Runs, Spans, elements, packed
 from .refit import Moments, fit, pivot_energy, quadratic, span_moments
 from .windows import Reward, best_segmentation, window_rewards
 
@@ -70,16 +70,18 @@ def merged_pivots(
     resting = _inside(space, valid.shape[-1])
     rewards = window_rewards(q, t, valid, resting, *lengths, reward, rest=False)
     windows = best_segmentation(rewards, lengths[0])
-    kind = jnp.where(windows.inside, LINE, NONE)
-    nowhere = jnp.zeros_like(t)
+    kind, seen = jnp.where(windows.inside, LINE, NONE), packed_bits(valid)
+
+    def nowhere(at: Array) -> tuple[Array, ...]:
+        return (jnp.zeros(at.shape, dtype),) * 3
+
     find, total = elements(
         kind,
-        (packed_bits(windows.is_first), packed_bits(windows.is_last)),
-        valid,
-        ~valid,
+        Runs(*map(packed_bits, (windows.inside, windows.is_first, windows.is_last))),
+        seen,
+        ~seen,
         nowhere,
         nowhere,
-        None,
     )
     items = find(0, capacity)
     spans = _merged(q, t, valid, items.kind != NONE, items.first, items.last, reward, rate)

@@ -99,7 +99,7 @@ def detection(
         middle,
         cut(host.sigma_3),
         cut(host.eps_3),
-        cut(host.sigma_1),
+        np.broadcast_to(cut(host.sigma_1), template.shape),
         cut(host.eps_1),
         cut(host.valid),
         cut(host.passed),

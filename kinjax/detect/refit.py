@@ -8,15 +8,15 @@ minimum is the pivot, the null space of `M` the axis. Positions are taken from a
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..bits import bits_between, counted, counts_at, packed_bits, unpacked_bits
-from ..numerics import CHUNK, in_chunks, running_count, running_sum, running_sum_at, safe_divide, safe_norm, safe_sqrt
+from ..bits import counted, counts_at, packed_bits
+from ..components import Parts
+from ..numerics import CHUNK, at_frames, in_chunks, running_count, running_sum, safe_divide, safe_norm, safe_sqrt
 from ..rotations import apply, apply_transposed, dot, matrix
 
 
@@ -73,7 +73,7 @@ class _Layout(NamedTuple):
 
 def _at(x: Array, frame: Int[Array, "spans objects"]) -> Array:
     """Values of (..., objects, frames) arrays at each span's `frame`: (..., objects, spans)."""
-    return jnp.take_along_axis(x, jnp.broadcast_to(frame.T, (*x.shape[:-1], frame.shape[0])), axis=-1)
+    return jnp.take_along_axis(x, jnp.broadcast_to(frame.T, (*x.shape[:-1], frame.shape[0])), axis=-1, mode="promise_in_bounds")
 
 
 def _layout(t: Array, valid: Array, begin: Array, end: Array, used: Array) -> _Layout:
@@ -89,6 +89,33 @@ def _layout(t: Array, valid: Array, begin: Array, end: Array, used: Array) -> _L
     return _Layout(span, inside, origin, t - jnp.take_along_axis(origin, jnp.broadcast_to(span, t.shape), axis=-1))
 
 
+PART = 8
+"""Frames whose places are added up once for all spans."""
+
+
+class PartMoments(NamedTuple):
+    """Of each `PART` frames of each object: how many were seen, their `mean` place (3), and the sum of squared distances to it."""
+
+    number: Float[Array, "objects parts"]
+    mean: Parts
+    square: Float[Array, "objects parts"]
+
+
+def part_moments(t: Float[Array, "3 objects frames"] | Parts, valid: Bool[Array, "objects frames"]) -> PartMoments:
+    """`t` is 0 where nothing is `valid`; frames are whole words of bits."""
+    seen, part = packed_bits(valid), jnp.uint32(2**PART - 1)
+    counts = [jax.lax.population_count((seen >> jnp.uint32(k)) & part) for k in range(0, 32, PART)]
+    number = jnp.stack(counts, axis=-1).reshape(valid.shape[0], -1).astype(t[0].dtype)
+
+    def total(x: Array) -> Array:  # XLA's own reduction of so short rows takes twice as long as a product with ones
+        rows = jnp.matmul(x.reshape(-1, PART), jnp.ones(PART, x.dtype), precision="highest")
+        return rows.reshape(x.shape[0], -1)
+
+    mean = tuple(total(x) / jnp.maximum(number, 1) for x in t)
+    apart = [jnp.where(valid, x - jnp.repeat(m, PART, axis=-1), 0) for x, m in zip(t, mean, strict=True)]
+    return PartMoments(number, mean, total(dot(apart, apart)))
+
+
 class Place(NamedTuple):
     """Mean world position of the object's origin over spans (3, spans, objects), and the root mean square distance to it."""
 
@@ -97,66 +124,68 @@ class Place(NamedTuple):
 
 
 def span_places(
-    t: Float[Array, "3 objects frames"],
+    t: Float[Array, "3 objects frames"] | Parts,
     valid: Bool[Array, "objects frames"],
     begin: Int[Array, "spans objects"],
     end: Int[Array, "spans objects"],
     used: Bool[Array, "spans objects"],
 ) -> Place:
-    """Refit of space constraints: running sums are enough, and no frame is gathered. Spans as for `span_moments`.
+    """Refit of space constraints, of places that are 0 where nothing is `valid`. Spans as for `span_moments`.
 
-    Each frame's origin is a running sum of the steps from one span's first place to the next one's; which frames are inside one,
-    and how many of them were seen, are questions of bits.
+    A span takes the parts that lie inside it as they are, and goes through its first and last part frame by frame. Distances are
+    never longer than a span is wide, so float32 suffices.
     """
-    objects, frames = valid.shape
-    slots, nothing = begin.shape[0], jnp.zeros((objects, frames), t.dtype)
-    seen = packed_bits(valid)
-    none = jnp.zeros_like(seen)
+    number, mean, square = part_moments(t, valid)
+    (objects, parts), slots = number.shape, begin.shape[0]
+    counts = counted(packed_bits(valid))
+
+    # the parts inside of spans, and what each is measured from, which is where its span begins: running sums of steps
     begins, ends = jnp.where(used, begin, 0), jnp.where(used, end, 0)
     before = jnp.concatenate([begins[:1], begins])[:slots]  # where the span before begins
     count = jnp.max(jnp.sum(used, axis=0, dtype=jnp.int32), initial=0)
-    lane, one = jnp.broadcast_to(jnp.arange(objects, dtype=jnp.int32), (CHUNK, objects)), jnp.uint32(1)
+    lane = jnp.broadcast_to(jnp.arange(objects, dtype=jnp.int32), (CHUNK, objects))
     rows = lambda x, first: jax.lax.dynamic_slice_in_dim(x, first, CHUNK, 0)  # noqa: E731
 
-    def mark(carried: tuple[Array, ...], at: Int[Array, ""]) -> tuple[tuple[Array, ...], None]:
-        begun, ended, *steps = carried
+    def mark(steps: tuple[Array, ...], at: Int[Array, ""]) -> tuple[tuple[Array, ...], None]:
         here, earlier, real = rows(begins, at), rows(before, at), rows(used, at)
-        first, until = jnp.where(real, here, frames), rows(ends, at)
-        some = until > here  # of these no two begin, or end, at one frame: bits can be added
-        begun, ended = (
-            bits.at[lane, jnp.where(some, x // 32, seen.shape[-1])].add(one << (x % 32).astype(jnp.uint32), mode="drop")
-            for bits, x in ((begun, here), (ended, until))
-        )
+        first, last = here // PART + 1, rows(ends, at) // PART
         is_first = (at + jnp.arange(CHUNK, dtype=jnp.int32) == 0)[:, None]
-        for i, x in enumerate(t):
-            step = jnp.where(real, _at(x, here).T - jnp.where(is_first, 0, _at(x, earlier).T), 0)
-            steps[i] = steps[i].at[lane, first].add(step, mode="drop")
-        return (begun, ended, *steps), None
+        path = [at_frames(x, here) - jnp.where(is_first, 0, at_frames(x, earlier)) for x in t]
+        some, one = real & (last > first), jnp.ones_like(path[0])
+        marks = [(first, real, x) for x in path] + [(first, some, one), (last, some, -one)]
+        into = [*range(len(path) + 1), len(path)]
+        out = list(steps)
+        for k, (part, which, step) in zip(into, marks, strict=True):
+            out[k] = out[k].at[lane, jnp.where(which, part, parts)].add(step, mode="drop")
+        return tuple(out), None
 
-    (begun, ended, *steps), _ = in_chunks(mark, (none, none, nothing, nothing, nothing), slots, count)
-    inside = unpacked_bits(seen & bits_between(begun ^ ended), frames)
-    path = [running_sum(s) for s in steps]
-    d = [x - y for x, y in zip(t, path, strict=True)]
-    sums = [running_sum_at(jnp.where(inside, x, 0)) for x in (*d, dot(d, d))]
-    seen_until = counted(seen)
+    nothing = jnp.zeros_like(number)
+    *path, inside = (running_sum(x) for x in in_chunks(mark, (nothing,) * 4, slots, count)[0])
+    off = [jnp.where(inside > 0, m - x, 0) for m, x in zip(mean, path, strict=True)]
+    sums = [running_sum(number * x) for x in off]
+    sums.append(running_sum(jnp.where(inside > 0, square, 0) + number * dot(off, off)))
 
     def place(state: None, at: Int[Array, ""]) -> tuple[None, tuple[Array, ...]]:
-        first, last, real = rows(begins, at), rows(ends, at), rows(used, at)
-        origin = [_at(x, first).T for x in path]
-        end_d = [_at(x, last).T - o for x, o in zip(t, origin, strict=True)]
-        ending = *end_d, dot(end_d, end_d)  # the last frame may be the next span's first
-        earlier, until = jnp.maximum(first - 1, 0).T, jnp.maximum(last - 1, 0).T
-        with_last, after_first = _at(valid, last).T, first > 0
-
-        def total(sums: Callable[[Array], Array], ending: Array) -> Array:
-            between = jnp.where(real, sums(until).T - jnp.where(after_first, sums(earlier).T, 0), 0)
-            return between + jnp.where(with_last, ending, 0)
-
-        *moments, square = (total(x, y) for x, y in zip(sums, ending, strict=True))
-        number = counts_at(seen_until, last.T) - jnp.where(after_first.T, counts_at(seen_until, earlier), 0)
-        n = jnp.maximum(number.T.astype(t.dtype), 1)
+        first, last = rows(begins, at), rows(ends, at)
+        begun, ended = first // PART, last // PART
+        some = ended > begun + 1
+        follows = jnp.minimum(begun + 1, parts - 1)
+        origin = [jnp.where(some, at_frames(y, follows), at_frames(x, first)) for x, y in zip(t, path, strict=True)]
+        # the frames of the first part, and of the last if it is another
+        within = jnp.arange(PART, dtype=jnp.int32)[:, None, None]
+        frame = PART * jnp.stack([begun, ended])[:, None] + within
+        mine = (frame >= jnp.stack([first, PART * (begun + 1)])[:, None]) & (frame <= last)
+        flat = frame.reshape(-1, objects)
+        near = [at_frames(x, flat).reshape(2 * PART, -1, objects) - o for x, o in zip(t, origin, strict=True)]
+        mine &= at_frames(valid, flat).reshape(frame.shape)
+        near = [jnp.where(mine.reshape(x.shape), x, 0) for x in near]
+        between = [jnp.where(some, at_frames(x, jnp.maximum(ended - 1, 0)) - at_frames(x, begun), 0) for x in sums]
+        # XLA's own sum over so few rows hands them to another thread
+        *moments, squares = (sum(x[1:], x[0]) + y for x, y in zip((*near, dot(near, near)), between, strict=True))
+        seen_until = counts_at(counts, last.T) - jnp.where(first.T > 0, counts_at(counts, jnp.maximum(first.T - 1, 0)), 0)
+        n = jnp.maximum(seen_until.T.astype(number.dtype), 1)
         center = [x / n for x in moments]
-        spread = safe_sqrt(jnp.maximum(square / n - dot(center, center), 0))
+        spread = safe_sqrt(jnp.maximum(squares / n - dot(center, center), 0))
         return state, (*(x + o for x, o in zip(center, origin, strict=True)), spread)
 
     *center, spread = in_chunks(place, None, slots, count)[1]
