@@ -21,7 +21,7 @@ from ..components import Parts, rotate
 from ..forward import world_transforms
 from ..lengths import BLOCK
 from ..numerics import at_frames, computed_once
-from ..rotations import cross, normalize
+from ..rotations import cross, dot
 from . import noise
 from .bounds import bounds
 from .displacements import Displacement, displacements, mean_pose, spikes
@@ -39,12 +39,17 @@ REST_NOISE = 0.003
 """Metres: the least noise that a rest is measured against (window method)."""
 
 
+Taught = tuple[tuple[Pattern, ...], tuple[Array, ...], tuple[tuple[Array, Array], ...]]
+"""Patterns, the marks of templates and thresholds, each by type."""
+
+
 class Observed(NamedTuple):
     """Steps 1 to 5 of some objects, which are the first axis of everything; vectors as tuples of components.
 
     The engine's own poses, normalised and with what is not `valid` at rest in the origin; `smooth` ones (None: the same);
     sigma_3, eps_3, sigma_1, eps_1 of all displacements (`values`; one for all where they are the same), which of them are `shown` by
-    valid frames and have `passed`, and, where lines are merged, their points and axes; patterns; noise `nu`.
+    valid frames and have `passed`, and, where lines are merged, their points and axes; where it is looked for, the noise `nu` and how
+    many frames are `missing` as spikes; what templates have `taught`.
     """
 
     q: Parts
@@ -55,17 +60,15 @@ class Observed(NamedTuple):
     shown: Array
     passed: Array
     lines: tuple[Parts, Parts] | None
-    patterns: tuple[Pattern, ...]
-    marks: tuple[Array, ...]
-    limits: tuple[tuple[Array, Array], ...]
-    nu: tuple[Array, Array]
-    missing: Array
+    nu: tuple[Array, Array] | None
+    missing: Array | None
+    taught: Taught | None
 
 
 PosesOf = Callable[[Any, int], tuple[Parts, Parts, Array]]
 """World quaternions and positions, by component, and which are seen, of so many objects from one on."""
 
-CACHED = 1 << 14
+CACHED = 1 << 15
 """Numbers of an array for which that and its likes stay in a core's second cache."""
 
 
@@ -82,9 +85,12 @@ def observed(
     """Steps 1 to 5, object by object: nothing of one reaches another."""
     paper = plan.method == "paper"
     # component by component, here and in what follows: XLA does not vectorise a loop over a stack of them
-    turned = [jnp.where(seen, x, 0 if i else 1) for i, x in enumerate(normalize(q))]
-    moved = [jnp.where(seen, x, 0) for x in t]
     never = numbers.rate < 0
+    square = dot(q, q)  # what is not a rotation becomes none
+    good = seen & (square > 0) & (square < jnp.inf)
+    scale = computed_once(1 / jnp.sqrt(jnp.where(good, square, 1)), never)
+    turned = [jnp.where(good, x * scale, 0 if i else 1) for i, x in enumerate(q)]
+    moved = [jnp.where(seen, x, 0) for x in t]
     turned, moved, seen = computed_once((turned, moved, seen), never)
     clip = Clip(jnp.stack(turned), jnp.stack(moved), seen)
     if not paper:
@@ -99,7 +105,8 @@ def observed(
     n = (x.w.shape[-1] // BLOCK) * BLOCK  # `prepare` pads by a block, so what is cut off is padding
     x = Displacement(*(a[..., :n] for a in x))
     points = _project(plan, numbers, x, smooth)
-    patterns, marks, limits = _thresholds(plan, numbers, points, x.valid, nu, templates, given)
+    taught = _thresholds(plan, numbers, points, x.valid, nu, templates, given)
+    limits = taught[2]
     passed = instantaneous(
         points.sigma_3,
         points.eps_3,
@@ -124,11 +131,9 @@ def observed(
         x.valid,
         passed,
         lines,
-        patterns,
-        marks,
-        limits,
-        nu,
-        jnp.sum(seen & ~clip.valid, axis=-1, dtype=jnp.int32),
+        None if paper else nu,
+        None if paper else jnp.sum(seen & ~clip.valid, axis=-1, dtype=jnp.int32),
+        taught if plan.templates else None,
     )
 
 
@@ -151,7 +156,12 @@ def run(
 
     firsts = jnp.arange(0, lanes, width, dtype=jnp.int32)
     o = jax.tree.map(lambda x: x.reshape(lanes, *x.shape[2:]), jax.lax.map(some, firsts))
-    never, nu = numbers.rate < 0, o.nu
+    never, zero = numbers.rate < 0, jnp.zeros(lanes, o.t[0].dtype)
+    nu = (zero, zero) if o.nu is None else o.nu
+    taught = o.taught
+    if taught is None:  # then they need no displacements
+        taught = _thresholds(plan, numbers, None, o.shown, nu, templates, given)
+    patterns, marks, limits = taught
     clip = Clip(jnp.stack(o.q), jnp.stack(o.t), o.valid)
     smooth = clip if o.smooth is None else Clip(jnp.stack(o.smooth[0]), jnp.stack(o.smooth[1]), o.valid)
     if plan.method == "window":
@@ -165,16 +175,16 @@ def run(
     found, overflow = _refit(plan, numbers, spans, clip), total
     pivot_noise = jnp.maximum(numbers.pivot_noise, jnp.maximum(numbers.pivot_floor, nu[0]))
     if plan.lines and not paper:
-        taught = numbers.pivot_noise
+        moving = numbers.pivot_noise
         if plan.templates:
-            taught = jnp.maximum(taught, template_noise(*clip, *templates[1]))
-        pivot_noise = jnp.maximum(pivot_noise, taught)
+            moving = jnp.maximum(moving, template_noise(*clip, *templates[1]))
+        pivot_noise = jnp.maximum(pivot_noise, moving)
         long = (spans.last - spans.first) >= numbers.least
         space = jnp.where(long, spans.kind, NONE), spans.first, spans.last
         pivots, more = merged_pivots(
             *clip,
             space,
-            taught,
+            moving,
             numbers.pivot_floor,
             nu,
             plan.pivot,
@@ -196,12 +206,12 @@ def run(
         eps_1,
         o.shown,
         o.passed,
-        o.marks,
-        o.limits,
-        o.patterns,
+        marks,
+        limits,
+        patterns,
         nu,
         pivot_noise,
-        o.missing,
+        jnp.zeros(lanes, jnp.int32) if o.missing is None else o.missing,
         jnp.where(asked & (end - begin >= numbers.least), kind, NONE),
         begin,
         end,
@@ -236,23 +246,22 @@ def _project(plan: Plan, numbers: Numbers, x: Displacement, poses: Clip) -> Sigm
 def _thresholds(
     plan: Plan,
     numbers: Numbers,
-    points: SigmaEpsilon,
+    points: SigmaEpsilon | None,
     valid: Array,
     nu: tuple[Array, Array],
     templates: TemplateSpans,
     given: tuple[Pattern, ...],
-) -> tuple[tuple[Pattern, ...], tuple[Array, ...], tuple[tuple[Array, Array], ...]]:
-    """Step 4: pattern, template marks and thresholds of each type that has one (space first, then line and point)."""
+) -> Taught:
+    """Step 4, for each type that has a pattern of its own (space first, then line and point). Without templates nothing asks for
+    `points`."""
     least, floor, most, margin = bounds(plan.method, plan.span, plan.mean, numbers, nu)
     middle = jnp.arange(valid.shape[-1], dtype=jnp.int32).astype(numbers.rate.dtype) + (
         0.5 if plan.method == "paper" else plan.span / 2
     )
     unmarked = jnp.zeros((valid.shape[0], 1), jnp.int32)
-    values = [(points.sigma_3, points.eps_3)] * plan.space
-    if plan.method == "paper" and plan.lines:
-        values.append((points.sigma_1, points.eps_1))
+    kinds = ["3"] * plan.space + ["1"] * (plan.method == "paper" and plan.lines)
     patterns, marks, limits = [], [], []
-    for i, (sigma, eps) in enumerate(values):
+    for i, kind in enumerate(kinds):
         if plan.given:
             pattern, mark = given[i], unmarked
         elif plan.templates:
@@ -260,7 +269,7 @@ def _thresholds(
                 lambda s, e, v, spans, lo, hi: noise.template_pattern(
                     s, e, v, spans, plan.span, plan.template_frames, plan.estimator, margin, lo, hi
                 )
-            )(sigma, eps, valid, templates[i], least, most)
+            )(getattr(points, "sigma_" + kind), getattr(points, "eps_" + kind), valid, templates[i], least, most)
         else:
             pattern, mark = noise.no_pattern(nu[0]), unmarked
         times = middle[:1] if noise.is_constant(pattern) else middle
