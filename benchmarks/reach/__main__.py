@@ -51,7 +51,7 @@ def main() -> int:
                     continue
                 print(
                     f"{name:<{width}}  {path:<4} {k:>3}   {s.feet_mean:8.5f} {s.feet_max:9.5f}  {s.hand_mean:9.5f}"
-                    f" {s.hand_max:10.5f} {s.hand_last:10.5f}  {s.jitter:8.3f}  {s.ms:10.3f}  {s.ms / base:7.2f}",
+                    f" {s.hand_max:10.5f} {s.hand_last:10.5f}  {s.jitter:8.3f}  {s.ms:10.4f}  {s.ms / base:7.2f}",
                     flush=True,
                 )
     for name, why in missing.items():

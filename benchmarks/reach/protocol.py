@@ -20,6 +20,10 @@ from benchmarks.numpy_baseline.deform.rotations import conjugate, log, multiply
 from .scene import Scene
 
 
+TURN = 4
+"""Runs of a solver in a row."""
+
+
 class Unavailable(Exception):
     """A solver that cannot run here; the message says why in one line."""
 
@@ -94,8 +98,9 @@ def compare(
 ) -> dict[str, Score | str]:
     """Scores by name of all solvers, or the line that says why there is none.
 
-    After a run that does not count (it loads and compiles) the solvers run in turns, `rounds` times each, so that a machine
-    whose speed drifts spoils no ratio. A solver stops taking turns after `longest` seconds.
+    After a run that does not count (it loads and compiles) the solvers take turns, `rounds` of them, so that a machine whose speed
+    drifts spoils no ratio; a turn is `TURN` runs, of which the first finds the caches as the solver before it left them. A
+    solver stops taking turns after `longest` seconds.
     """
     scores: dict[str, Score | str] = {}
     spent: dict[str, list[float]] = {}
@@ -112,9 +117,10 @@ def compare(
             times = spent.get(solver.name)
             if times is None or sum(times) > longest:
                 continue
-            begin = time.perf_counter()
-            solver.run(scene, path, k)
-            times.append(time.perf_counter() - begin)
+            for _ in range(TURN):
+                begin = time.perf_counter()
+                solver.run(scene, path, k)
+                times.append(time.perf_counter() - begin)
     for name, times in spent.items():
         had = scores[name]
         if isinstance(had, Score) and times:

@@ -253,7 +253,10 @@ class _Iteration:
         turns, home = (jnp.swapaxes(x[..., 3:].reshape(*x.shape[:-1], -1, 3), -1, -2) for x in (across, z))
 
         def attempt(tried: Tried) -> Tried:
-            along = tried.along + mend * fix(wrong(tried.residual))
+            # nothing has gone wrong before the first attempt
+            along = jax.lax.cond(
+                tried.times > 0, lambda: tried.along + mend * fix(wrong(tried.residual)), lambda: tried.along
+            )
             turn = combined(turns, along) + posture[:, None, None] * home
             root = combined(across[:, :3], along) + posture[:, None] * z[:3]
             trial = stepped(self.chain, s.pose, answer, root.T, jnp.swapaxes(turn, 0, 1))

@@ -166,11 +166,9 @@ def output_motion(motion: Motion, plan: Plan, solved: Any) -> Motion:
     top = motion.skeleton.topology
     frames, n = plan.frames, len(plan.kept)
     q = np.array(motion.rotations, float)
-    changed = np.moveaxis(
-        solved.rotations[:, :, :n] != frames.rotations[:, :, :n].astype(solved.rotations.dtype), 1, 2
-    ).any(-1)
-    new = np.moveaxis(solved.rotations[:, :, :n].astype(float), 1, 2)
-    q[:, plan.kept] = np.where(changed[..., None], new, q[:, plan.kept])
+    new = solved.rotations[:, :, :n]
+    changed = (new != frames.rotations[:, :, :n].astype(new.dtype, copy=False)).any(1)[..., None]
+    q[:, plan.kept] = np.where(changed, np.moveaxis(new, 1, 2), q[:, plan.kept])
     t = np.array(motion.translations, float)
     root = int(plan.kept[0])
     if root in top.translated:

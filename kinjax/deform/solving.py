@@ -88,11 +88,12 @@ def solve(
             piece = _solve(chain, tasks, piece_of(cast, begin, end, MOST), pose, numbers, some, **static)
             piece = jax.tree.map(lambda x, n=end - begin: np.asarray(x)[:n], piece)
         out.append(piece)
-        pose = _last(piece, cast, begin, pose)
-        linked = old is not None and _close(pose, _last(_taken(old, plan, begin, end), cast, begin, pose))
+        if end < count:
+            pose = _last(piece, cast, begin, pose)
+            linked = old is not None and _close(pose, _last(_taken(old, plan, begin, end), cast, begin, pose))
         tell(end - begin)
         begin = end
-    return Run(plan, frames, jax.tree.map(lambda *x: np.concatenate(x), *out))
+    return Run(plan, frames, jax.tree.map(lambda *x: np.concatenate(x) if len(x) > 1 else x[0], *out))
 
 
 def solve_many(plans: Sequence[Plan], settings: Settings, tell: Callable[[int], None]) -> list[Any]:
@@ -126,7 +127,7 @@ def solver_numbers(settings: Settings, dtype: np.dtype) -> Solving:
 
 def as_dtype(tree: Any, dtype: np.dtype) -> Any:
     """A tree of arrays with its floating-point ones in another precision."""
-    return jax.tree.map(lambda x: x.astype(dtype) if np.issubdtype(x.dtype, np.floating) else x, tree)
+    return jax.tree.map(lambda x: x.astype(dtype, copy=False) if np.issubdtype(x.dtype, np.floating) else x, tree)
 
 
 def _stack(trees: Sequence[Any]) -> Any:
