@@ -1,7 +1,7 @@
 """Low-pass filtering of what a deformation added, so that neighbouring frames stay alike (2004 paper, section 5.2).
 
 In: the displacement map of the root's translation, or of joint rotations. Out: the same, smoothed by a symmetric FIR filter
-(no delay), constant beyond the clip's ends. Frames that are lost are bridged first: a filter would spread them. Host NumPy.
+(no delay); beyond the clip's ends it goes on as its own mirror image through the end point. Frames that are lost are bridged first: a filter would spread them. Host NumPy.
 """
 
 from __future__ import annotations
@@ -24,10 +24,13 @@ def taps(cutoff: float, width: float, rate: float) -> Float[np.ndarray, " k"]:
 
 
 def low_pass(path: Float[np.ndarray, "f ..."], fir: Float[np.ndarray, " k"]) -> Float[np.ndarray, "f ..."]:
-    """Filtered along the first axis; beyond the ends the path is taken to stay where it was."""
+    """Filtered along the first axis. Beyond its ends the path goes on as it went, turned half round about its end point: a path
+    that moves there stays where it is, and does not slow down towards its end."""
     if len(fir) == 1:
         return path
-    return correlate1d(path, fir, axis=0, mode="nearest")
+    half = len(fir) // 2
+    longer = np.pad(path, [(half, half)] + [(0, 0)] * (path.ndim - 1), mode="reflect", reflect_type="odd")
+    return correlate1d(longer, fir, axis=0)[half:-half]
 
 
 def bridged(path: Float[np.ndarray, "f ..."], lost: Bool[np.ndarray, " f"]) -> Float[np.ndarray, "f ..."]:
