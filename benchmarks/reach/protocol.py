@@ -19,7 +19,6 @@ from benchmarks.numpy_baseline.deform.rotations import conjugate, log, multiply
 
 from .scene import Scene
 
-
 TURN = 4
 """Runs of a solver in a row."""
 

@@ -1,7 +1,8 @@
 """Low-pass filtering of what a deformation added, so that neighbouring frames stay alike (2004 paper, section 5.2).
 
 In: the displacement map of the root's translation, or of joint rotations. Out: the same, smoothed by a symmetric FIR filter
-(no delay); beyond the clip's ends it goes on as its own mirror image through the end point. Frames that are lost are bridged first: a filter would spread them. Host NumPy.
+(no delay); beyond the clip's ends it goes on as its own mirror image through the end point. Frames that are lost are bridged
+first: a filter would spread them. Host NumPy.
 """
 
 from __future__ import annotations
