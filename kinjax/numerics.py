@@ -135,7 +135,7 @@ def at_frames(x: Array, index: Int[Array, "k lanes"]) -> Array:
     return jnp.take_along_axis(x, index.T, axis=-1, mode="promise_in_bounds").T
 
 
-CHUNK = 32
+CHUNK = 16
 """Rows that `in_chunks` takes at once."""
 
 

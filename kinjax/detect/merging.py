@@ -34,7 +34,7 @@ class Tolerance(NamedTuple):
 class Elements(NamedTuple):
     """What the scan steps over, (capacity, objects): kind, first and last displacement, where it begins and ends, its axis.
 
-    `fails` and `gone`: failing valid, and invalid, displacements before the first and up to the last one (two rows each).
+    `fails`: failing valid displacements before it (an element has none). `gone`: invalid ones before the first, and up to the last.
     """
 
     kind: Int[Array, "capacity objects"]
@@ -43,7 +43,7 @@ class Elements(NamedTuple):
     start: Float[Array, "3 capacity objects"]
     stop: Float[Array, "3 capacity objects"]
     axis: Float[Array, "3 capacity objects"]
-    fails: Int[Array, "2 capacity objects"]
+    fails: Int[Array, "capacity objects"]
     gone: Int[Array, "2 capacity objects"]
 
 
@@ -143,7 +143,7 @@ def elements(
             begun,
             ended,
             jnp.zeros_like(begun) if axis is None else jnp.stack(axis(i.T)),
-            jnp.stack([counts_at(failed, i).T, counts_at(failed, j).T]),
+            counts_at(failed, i).T,
             jnp.stack([counts_at(lost, i).T, counts_at(lost, j).T]),
         )
 
@@ -165,9 +165,9 @@ def _merged_rests(find: Find, most: Int[Array, ""], objects: int, capacity: int,
 
     def chunk(before: tuple[Array, ...], first: Int[Array, ""]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         items = find(first, CHUNK)
-        new = items.kind != NONE, items.fails[1], items.gone[1], *items.stop
+        new = items.kind != NONE, items.fails, items.gone[1], *items.stop
         some, fails, gone, *at = (jnp.concatenate([b, x[:-1]]) for b, x in zip(before, new, strict=True))
-        gap = items.fails[0] - fails
+        gap = items.fails - fails
         distance = safe_norm(items.start - jnp.stack(at), axis=0)
         joins = some & (items.gone[0] - gone <= tolerance.max_missing) & (distance <= tolerance.max_jump)
         joins &= gap <= frame_tolerance(distance, tolerance.max_gap, tolerance.max_jump)
@@ -196,7 +196,7 @@ def _merged_in_order(find: Find, most: Int[Array, ""], objects: int, capacity: i
     def step(open_: Any, new: Any) -> tuple[Any, Any]:
         kind, first, last, at, axis, fails, gone = open_
         n_kind, n_first, n_last, n_start, n_stop, n_axis, n_fails, n_gone = new
-        gap = n_fails[0] - fails
+        gap = n_fails - fails
         connected = (n_gone[0] - gone <= tolerance.max_missing) & (kind != NONE)
         apart = n_start - at
         distance = safe_norm(apart, axis=0)
@@ -228,14 +228,15 @@ def _merged_in_order(find: Find, most: Int[Array, ""], objects: int, capacity: i
             jnp.where(real, n_last, last),
             jnp.where(real, jnp.where(joins, point, n_stop), at),
             jnp.where(real, n_axis, axis),
-            jnp.where(real, n_fails[1], fails),
+            jnp.where(real, n_fails, fails),
             jnp.where(real, n_gone[1], gone),
         )
         return state, out
 
     def chunk(state: Any, first: Int[Array, ""]) -> tuple[Any, Any]:
         items = find(first, CHUNK)
-        along = *items[:3], *(jnp.moveaxis(x, 1, 0) for x in items[3:])
+        start, stop, axis, gone = (jnp.moveaxis(x, 1, 0) for x in (items.start, items.stop, items.axis, items.gone))
+        along = *items[:3], start, stop, axis, items.fails, gone
         return jax.lax.scan(step, state, along)
 
     start = (jnp.full_like(zero, NONE), zero, zero, zero3, zero3, zero, zero)
