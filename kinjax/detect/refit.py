@@ -146,18 +146,19 @@ def span_places(
     lane = jnp.broadcast_to(jnp.arange(objects, dtype=jnp.int32), (CHUNK, objects))
     rows = lambda x, first: jax.lax.dynamic_slice_in_dim(x, first, CHUNK, 0)  # noqa: E731
 
-    def mark(steps: tuple[Array, ...], at: Int[Array, ""]) -> tuple[tuple[Array, ...], None]:
+    def mark(marks: tuple[Array, ...], at: Int[Array, ""]) -> tuple[tuple[Array, ...], None]:
+        *steps, switches = marks
         here, earlier, real = rows(begins, at), rows(before, at), rows(used, at)
         first, last = here // PART + 1, rows(ends, at) // PART
         is_first = (at + jnp.arange(CHUNK, dtype=jnp.int32) == 0)[:, None]
-        path = [at_frames(x, here) - jnp.where(is_first, 0, at_frames(x, earlier)) for x in t]
-        some, one = real & (last > first), jnp.ones_like(path[0])
-        marks = [(first, real, x) for x in path] + [(first, some, one), (last, some, -one)]
-        into = [*range(len(path) + 1), len(path)]
-        out = list(steps)
-        for k, (part, which, step) in zip(into, marks, strict=True):
-            out[k] = out[k].at[lane, jnp.where(which, part, parts)].add(step, mode="drop")
-        return tuple(out), None
+        place = lane, jnp.where(real, first, parts)
+        for k, x in enumerate(t):
+            step = at_frames(x, here) - jnp.where(is_first, 0, at_frames(x, earlier))
+            steps[k] = steps[k].at[place].add(step, mode="drop")
+        some = real & (last > first)
+        switches = switches.at[lane, jnp.where(some, first, parts)].add(1, mode="drop")
+        switches = switches.at[lane, jnp.where(some, last, parts)].add(-1, mode="drop")
+        return (*steps, switches), None
 
     nothing = jnp.zeros_like(number)
     *path, inside = (running_sum(x) for x in in_chunks(mark, (nothing,) * 4, slots, count)[0])
