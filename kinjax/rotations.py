@@ -56,7 +56,7 @@ def rotate(q: Quaternion | Parts, v: Vector | Parts) -> Vector:
     return jnp.stack(components.rotate(q, v))
 
 
-def normalize(q: Quaternion | Parts) -> Quaternion:
+def normalize(q: Quaternion) -> Quaternion:
     """Unit quaternion; zero and non-finite ones become the identity (their frames are masked)."""
     n2 = dot(q, q)
     good = (n2 > 0) & jnp.isfinite(n2)

@@ -20,14 +20,11 @@ from kinjax.cli.cache import use_deform_flags
 
 
 def smoothed(path: np.ndarray, half: int) -> np.ndarray:
-    """(F, ...) by a Hann window of `half` frames to either side; the path goes on beyond its ends as its own mirror image."""
-    from scipy.ndimage import correlate1d
+    """(F, ...) by a Hann window of `half` frames to either side."""
+    from kinjax.deform.filtering import low_pass
 
-    if not half:
-        return path
     window = np.hanning(2 * half + 3)[1:-1]
-    longer = np.pad(path, [(half, half)] + [(0, 0)] * (path.ndim - 1), mode="reflect", reflect_type="odd")
-    return correlate1d(longer, window / window.sum(), axis=0)[half:-half]
+    return low_pass(path, window / window.sum())
 
 
 def main() -> int:

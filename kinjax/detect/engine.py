@@ -1,9 +1,9 @@
 """The jitted pipeline: poses of all objects of a clip in, constraints out, as arrays of fixed shape.
 
-In: `Clip` (components first, padded to a bucket), template spans, and `Numbers`; static: `Plan`. Out: `Found`. Steps 1 to
-6 of the paper in order, for the three methods. Nothing here raises or depends on a length, an object's name or a
-threshold's value, so a second clip of the same bucket compiles nothing. Clips of a batch are more objects: they share
-nothing but `Numbers`.
+In: `Clip` (components first, padded to a bucket) or `Joints`, template spans, and `Numbers`; static: `Plan`. Out: `Found`. Steps 1
+to 6 of the paper in order, for the three methods: the first five by `observing`, a few objects at a time. Nothing here raises
+or depends on a length, an object's name or a threshold's value, so a second clip of the same bucket compiles nothing.
+Clips of a batch are more objects: they share nothing but `Numbers`.
 """
 
 from __future__ import annotations

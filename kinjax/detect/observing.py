@@ -57,7 +57,8 @@ def observed(
     paper = plan.method == "paper"
     # component by component, here and in what follows: XLA does not vectorise a loop over a stack of them
     never = numbers.rate < 0
-    square = dot(q, q)  # what is not a rotation becomes none
+    # as `rotations.normalize`, but with one square root a quaternion: XLA would take it again for each component
+    square = dot(q, q)
     good = seen & (square > 0) & (square < jnp.inf)
     scale = computed_once(1 / jnp.sqrt(jnp.where(good, square, 1)), never)
     turned = [jnp.where(good, x * scale, 0 if i else 1) for i, x in enumerate(q)]
