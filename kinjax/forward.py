@@ -9,6 +9,7 @@ form instead: with `A` the matrix of who is an ancestor of whom, world angular v
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import jax
@@ -57,6 +58,9 @@ def world_transforms(
         t = [jnp.where(path >= 0, m, o) for m, o in zip(rows(moving, jnp.maximum(path, 0)), offset, strict=True)]
         here = (*multiply(above[:4], q), *(a + b for a, b in zip(above[4:], rotate(above[:4], t), strict=True)))
         world = tuple(jax.lax.dynamic_update_index_in_dim(w, h, j, 0) for w, h in zip(world, here, strict=True))
+        # never: but what is fetched depends on all that was written, else XLA fetches in between, and copies what it still needs
+        never = functools.reduce(jnp.add, (jax.lax.dynamic_slice(w, (j, jnp.int32(0)), (1, 1))[0, 0] for w in world)) > jnp.inf
+        following = following + never.astype(jnp.int32)
         return (world, tuple(row(w, following) for w in world)), None
 
     following = jnp.roll(jnp.where(parents < 0, joints, parents), -1)

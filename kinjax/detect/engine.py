@@ -20,6 +20,7 @@ from ..bits import packed_bits
 from ..components import Parts, rotate
 from ..forward import world_transforms
 from ..numerics import at_frames, computed_once
+from ..rotations import dot
 from . import noise
 from .displacements import mean_pose
 from .instantaneous import LINE, NONE, POINT, SPACE
@@ -219,15 +220,25 @@ def _refit(plan: Plan, numbers: Numbers, spans: Spans, clip: Clip) -> tuple[Arra
 
 @partial(jax.jit, static_argnames="plan")
 def run_poses(plan: Plan, numbers: Numbers, clip: Clip, templates: TemplateSpans, given: tuple[Pattern, ...]) -> Found:
-    """Detection from world poses."""
-    return run(plan, numbers, rows_of(clip), clip.valid.shape, templates, given)
+    """Detection from world poses, whose quaternions are normalised."""
+    never = numbers.rate < 0
+
+    def unit(first: Array, width: int) -> tuple[Parts, Parts, Array]:
+        q, t, seen = rows_of(clip)(first, width)
+        # as `rotations.normalize`, but with one square root a quaternion: XLA would take it again for each component
+        square = dot(q, q)
+        good = seen & (square > 0) & (square < jnp.inf)
+        scale = computed_once(1 / jnp.sqrt(jnp.where(good, square, 1)), never)
+        return tuple(jnp.where(good, x * scale, 0 if i else 1) for i, x in enumerate(q)), t, seen
+
+    return run(plan, numbers, unit, clip.valid.shape, templates, given)
 
 
 @partial(jax.jit, static_argnames="plan")
 def run_joints(
     plan: Plan, numbers: Numbers, joints: Joints, templates: TemplateSpans, given: tuple[Pattern, ...]
 ) -> Found:
-    """Detection from joint rotations: forward kinematics first, in the same compiled function."""
+    """Detection from joint rotations, which are unit as all of a motion's: forward kinematics first, in the same compiled function."""
     shape = joints.used.shape[0], joints.valid.shape[0]
     return run(plan, numbers, joint_poses(joints), shape, templates, given)
 

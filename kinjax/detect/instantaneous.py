@@ -27,7 +27,7 @@ def instantaneous(
 ) -> Int[Array, "..."]:
     """Space where `sigma_3` and `eps_3` are within their thresholds; else line where `sigma_1` and `eps_1` are, and the
     rotation is large enough to have an axis. `None`: that type is not looked for."""
-    kind = jnp.zeros(sigma_3.shape, jnp.int32)
+    kind = jnp.zeros(sigma_3.shape, jnp.int8)
     if line is not None:
         sigma_max, eps_max = line
         turning = sigma_3 > jnp.maximum(sigma_max, axis_min)

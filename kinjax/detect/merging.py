@@ -137,7 +137,7 @@ def elements(
         i, j = jnp.minimum(first, n - 1), jnp.minimum(last, n - 1)
         begun, ended = jnp.stack(start(i.T)), jnp.stack(stop(j.T))
         return Elements(
-            jnp.where((first < n).T, at_frames(kind, i.T), NONE),
+            jnp.where((first < n).T, at_frames(kind, i.T).astype(jnp.int32), NONE),
             i.T,
             j.T,
             begun,

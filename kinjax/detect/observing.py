@@ -15,7 +15,7 @@ from jaxtyping import Array
 from ..components import Parts
 from ..lengths import BLOCK
 from ..numerics import computed_once
-from ..rotations import cross, dot
+from ..rotations import cross
 from . import noise
 from .bounds import bounds
 from .displacements import Displacement, displacements, mean_pose, spikes
@@ -31,7 +31,7 @@ Taught = tuple[tuple[Pattern, ...], tuple[Array, ...], tuple[tuple[Array, Array]
 class Observed(NamedTuple):
     """Steps 1 to 5 of some objects, which are the first axis of everything; vectors as tuples of components.
 
-    The engine's own poses, normalised and with what is not `valid` at rest in the origin; `smooth` ones (None: the same);
+    The engine's own poses, with what is not `valid` at rest in the origin; `smooth` ones (None: the same);
     sigma_3, eps_3, sigma_1, eps_1 of all displacements (`values`; one for all where they are the same), which of them are `shown` by
     valid frames and have `passed`, and, where lines are merged, their points and axes; where it is looked for, the noise `nu` and how
     many frames are `missing` as spikes; what templates have `taught`.
@@ -53,15 +53,11 @@ class Observed(NamedTuple):
 def observed(
     plan: Plan, numbers: Numbers, q: Parts, t: Parts, seen: Array, templates: TemplateSpans, given: tuple[Pattern, ...]
 ) -> Observed:
-    """Steps 1 to 5, object by object: nothing of one reaches another."""
+    """Steps 1 to 5, object by object: nothing of one reaches another. Quaternions are unit where `seen`."""
     paper = plan.method == "paper"
     # component by component, here and in what follows: XLA does not vectorise a loop over a stack of them
     never = numbers.rate < 0
-    # as `rotations.normalize`, but with one square root a quaternion: XLA would take it again for each component
-    square = dot(q, q)
-    good = seen & (square > 0) & (square < jnp.inf)
-    scale = computed_once(1 / jnp.sqrt(jnp.where(good, square, 1)), never)
-    turned = [jnp.where(good, x * scale, 0 if i else 1) for i, x in enumerate(q)]
+    turned = [jnp.where(seen, x, 0 if i else 1) for i, x in enumerate(q)]
     moved = [jnp.where(seen, x, 0) for x in t]
     turned, moved, seen = computed_once((turned, moved, seen), never)
     clip = Clip(jnp.stack(turned), jnp.stack(moved), seen)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from ..errors import OptionError, ShapeError, find_name
@@ -46,10 +46,17 @@ class Prepared:
     original_rate: float
     original_frames: int
 
+    @property
+    def missing(self) -> np.ndarray:
+        """(objects,) frames in which each object was not seen."""
+        rows = self.valid if self.valid.strides[0] else self.valid[:1]  # one row for all needs to be counted once
+        return np.broadcast_to(self.frames - np.count_nonzero(rows, axis=1), len(self.valid))
+
 
 def working_dtype() -> np.dtype:
     """float64 where JAX has it enabled, else float32."""
-    return np.dtype(jnp.result_type(float))
+    double = jax.config.jax_enable_x64  # type: ignore[attr-defined]
+    return np.dtype(np.float64 if double else np.float32)
 
 
 def as_poses(source: Motion | Poses, objects: Sequence[str] | None, relative_to: str | None) -> Poses:
@@ -194,35 +201,40 @@ def _aligned(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
     return raw[-raw.ctypes.data % _LINE :][:size].view(dtype).reshape(shape)
 
 
-def _frames_last(q: np.ndarray, joints: Sequence[int], room: int, length: int, dtype: np.dtype) -> np.ndarray:
-    """Rotations (frames, all, 4) of some joints as (room, 4, length), filled up with the identity."""
+def _frames_last(
+    q: np.ndarray, joints: Sequence[int], room: int, length: int, dtype: np.dtype
+) -> tuple[np.ndarray, bool]:
+    """Rotations (frames, all, 4) of some joints as (room, 4, length), filled up with the identity; and is every number finite?
+
+    Where their squares can be added up, they are; only where not, each is looked at.
+    """
     frames, count = len(q), len(joints)
     out = _aligned((room, 4, length), dtype)
     out[:, :, frames:] = out[count:] = np.eye(4)[0][:, None]
-    if q.strides[0] == q.itemsize:  # as the readers leave it: each row is copied whole
-        for i, j in enumerate(joints):
-            out[i, :, :frames] = q[:, j].T
-        return out
-    some = slice(None) if count == q.shape[1] else list(joints)
-    for begin in range(0, frames, _PIECE):  # what is turned round stays in the cache
-        piece = q[begin : begin + _PIECE, some].astype(dtype)
-        out[:count, :, begin : begin + len(piece)] = piece.transpose(1, 2, 0)
-    return out
-
-
-def _all_finite(x: np.ndarray) -> bool:
-    """Is every number finite? Where their squares can be added up, they are; only where not, each is looked at."""
-    flat = x.reshape(-1)
+    squares = 0.0
     with np.errstate(over="ignore", invalid="ignore"):
-        return bool(np.isfinite(np.dot(flat, flat))) or bool(np.isfinite(x).all())
+        if q.strides[0] == q.itemsize:  # as the readers leave it: each row is copied whole
+            for i, j in enumerate(joints):
+                out[i, :, :frames] = q[:, j].T
+                flat = out[i].reshape(-1)
+                squares += float(np.dot(flat, flat))
+        else:
+            some = slice(None) if count == q.shape[1] else list(joints)
+            for begin in range(0, frames, _PIECE):  # what is turned round stays in the cache
+                piece = q[begin : begin + _PIECE, some].astype(dtype)
+                out[:count, :, begin : begin + len(piece)] = piece.transpose(1, 2, 0)
+                flat = piece.reshape(-1)
+                squares += float(np.dot(flat, flat))
+    return out, bool(np.isfinite(squares)) or bool(np.isfinite(out).all())
 
 
 def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool, padded: Padded) -> Prepared:
     """A motion as the engine takes it: only the objects and their ancestors, so that one hand costs one arm."""
     check_rate(float(motion.rate))
     top = motion.skeleton.topology
-    names = top.names if objects is None else objects
-    at = list(dict.fromkeys(find_name(n, top.names, "joint", motion.name) for n in names))
+    at = list(range(len(top.names)))
+    if objects is not None:
+        at = list(dict.fromkeys(find_name(n, top.names, "joint", motion.name) for n in objects))
     if not at:
         raise OptionError("no object to look at")
     joints, rows = used_joints(motion, at)
@@ -230,16 +242,16 @@ def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool, 
     moving = [top.translated[k] for k in rows]
     dtype, frames = working_dtype(), motion.frames
     length, room = padded(frames + BLOCK), 8 * -(-len(joints) // 8)
-    t = np.asarray(np.asarray(motion.translations)[:, list(rows)], float)
+    t = np.asarray(motion.translations)[:, list(rows)].astype(float)
     valid: Any = np.ones(frames, bool)
-    rotations = _frames_last(np.asarray(motion.rotations), joints, room, length, dtype)
-    if not (_all_finite(rotations) and np.isfinite(t).all()):  # frame by frame takes three times as long
+    rotations, finite = _frames_last(np.asarray(motion.rotations), joints, room, length, dtype)
+    if not (finite and np.isfinite(t).all()):  # frame by frame takes three times as long
         valid = np.isfinite(rotations[..., :frames]).all((0, 1)) & np.isfinite(t).all((1, 2))
     root = np.array([top.parents[j] < 0 for j in moving])
-    origin = t[np.argmax(valid), int(np.argmax(root))] if near and valid.any() and root.any() else np.zeros(3)
-    t = t - root[:, None] * origin
+    origin = t[np.argmax(valid), int(np.argmax(root))].copy() if near and valid.any() and root.any() else np.zeros(3)
+    t -= root[:, None] * origin
     if not valid.all():
-        t = np.where(valid[:, None, None], t, 0)
+        t[~valid] = 0
         rotations[:, :, np.flatnonzero(~valid)] = np.array([1, 0, 0, 0], dtype)[:, None]
     translations = np.zeros((len(moving), 3, length), dtype)
     translations[..., :frames] = t.transpose(1, 2, 0)

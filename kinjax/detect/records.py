@@ -56,7 +56,7 @@ def detection(
     objects = len(clip.names)
     n = clip.frames - plan.span
     cut = lambda x: x[:objects, :n].T  # noqa: E731
-    slot, lane = np.nonzero(host.kind[:, :objects])
+    slot, lane = np.nonzero(host.kind)  # padding finds nothing
     scale = clip.original_rate / clip.rate
     frame = lambda x: np.minimum(np.floor(x * scale + 0.5).astype(int), clip.original_frames - 1)  # noqa: E731
     records = list(patterns)
@@ -94,7 +94,7 @@ def detection(
     limits: list[dict[Any, np.ndarray]] = [
         {k: np.broadcast_to(cut(pair[i]), template.shape) for k, pair in zip(kinds, host.limits, strict=True)} for i in (0, 1)
     ]
-    absent = clip.frames - np.count_nonzero(clip.valid, axis=1)
+    absent = clip.missing
     return Detection(
         middle,
         cut(host.sigma_3),
@@ -126,17 +126,18 @@ def pattern_records(
     """The engine's patterns as records: one for each object and type."""
     out = []
     scale = clip.original_rate / clip.rate
+    automatic = "given" if settings.thresholds else "automatic"
     for kind, pattern, limit in zip(kinds_of(plan)[: len(host.limits)], host.patterns, host.limits, strict=True):
-        for lane, name in enumerate(clip.names):
-            count = int(pattern.size[lane])
-            mine = tuple(
-                t
-                for t in templates
-                if t.object.casefold() == name.casefold() and ("space" if t.type == "space" else "line") == kind
-            )
-            asked: Any = kind if kind == "space" or "line" in settings.types else "point"
+        asked: Any = kind if kind == "space" or "line" in settings.types else "point"
+        first = [x[:, 0].tolist() for x in limit]
+        for lane, (name, count) in enumerate(zip(clip.names, pattern.size.tolist(), strict=False)):
             if count:
                 used = slice(0, count)
+                mine = tuple(
+                    t
+                    for t in templates
+                    if t.object.casefold() == name.casefold() and ("space" if t.type == "space" else "line") == kind
+                )
                 bits = int(np.bitwise_or.reduce(pattern.status[lane][: len(mine)], initial=0))
                 if float((host.passed[lane, : clip.frames - plan.span] > 0).mean()) > 0.8:
                     bits |= noise.UNREPRESENTATIVE
@@ -157,17 +158,16 @@ def pattern_records(
                     )
                 )
             else:
-                status = "given" if settings.thresholds else "automatic"
                 out.append(
                     NoisePattern(
                         name,
                         asked,
-                        (float(limit[0][lane, 0]),),
-                        (float(limit[1][lane, 0]),),
+                        (first[0][lane],),
+                        (first[1][lane],),
                         (),
-                        settings.alpha_max,  # type: ignore[arg-type]
+                        settings.alpha_max,
                         settings.dist_max,
-                        status=status,
+                        status=automatic,
                         unit=unit_of(settings),  # type: ignore[arg-type]
                     )
                 )
@@ -198,10 +198,11 @@ def _warnings(clip: Prepared, patterns: Sequence[NoisePattern], absent: np.ndarr
     """What a person should know, in words. A stray spike is no news; more than one frame in fifty is."""
     out = []
     for p in patterns:
-        out += [f"{p.object} ({p.type}): {_WORDS[s]}" for s in p.status.split("+") if s in _WORDS]
-    for name, unseen, spiky in zip(clip.names, absent, spikes, strict=True):
+        if p.status not in ("ok", "given", "automatic"):
+            out += [f"{p.object} ({p.type}): {_WORDS[s]}" for s in p.status.split("+") if s in _WORDS]
+    for name, unseen, spiky in zip(clip.names, absent.tolist(), spikes.tolist(), strict=True):
         if unseen:
             out.append(f"{name}: {unseen} of {clip.frames} frames are missing; they were masked")
         if spiky * 50 > clip.frames:
-            out.append(f"{name}: {int(spiky)} of {clip.frames} frames were rejected as spikes")
+            out.append(f"{name}: {spiky} of {clip.frames} frames were rejected as spikes")
     return out

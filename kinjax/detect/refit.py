@@ -8,6 +8,7 @@ minimum is the pivot, the null space of `M` the axis. Positions are taken from a
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -107,13 +108,12 @@ def part_moments(t: Float[Array, "3 objects frames"] | Parts, valid: Bool[Array,
     counts = [jax.lax.population_count((seen >> jnp.uint32(k)) & part) for k in range(0, 32, PART)]
     number = jnp.stack(counts, axis=-1).reshape(valid.shape[0], -1).astype(t[0].dtype)
 
-    def total(x: Array) -> Array:  # XLA's own reduction of so short rows takes twice as long as a product with ones
-        rows = jnp.matmul(x.reshape(-1, PART), jnp.ones(PART, x.dtype), precision="highest")
-        return rows.reshape(x.shape[0], -1)
-
-    mean = tuple(total(x) / jnp.maximum(number, 1) for x in t)
-    apart = [jnp.where(valid, x - jnp.repeat(m, PART, axis=-1), 0) for x, m in zip(t, mean, strict=True)]
-    return PartMoments(number, mean, total(dot(apart, apart)))
+    # added up one by one: XLA's own reduction of so short rows takes several times as long
+    rows = lambda x: [x.reshape(*number.shape, PART)[..., i] for i in range(PART)]  # noqa: E731
+    total = functools.partial(functools.reduce, jnp.add)
+    mean = tuple(total(rows(x)) / jnp.maximum(number, 1) for x in t)
+    apart = ([x - m for x in rows(y)] for y, m in zip(t, mean, strict=True))
+    return PartMoments(number, mean, total(jnp.where(v, dot(d, d), 0) for v, *d in zip(rows(valid), *apart, strict=True)))
 
 
 class Place(NamedTuple):
@@ -145,6 +145,8 @@ def span_places(
     count = jnp.max(jnp.sum(used, axis=0, dtype=jnp.int32), initial=0)
     lane = jnp.broadcast_to(jnp.arange(objects, dtype=jnp.int32), (CHUNK, objects))
     rows = lambda x, first: jax.lax.dynamic_slice_in_dim(x, first, CHUNK, 0)  # noqa: E731
+    take = jax.vmap(lambda x, i: x.at[i[:, 0]].get(mode="promise_in_bounds"))
+    whole = lambda x, part: take(x.reshape(objects, parts, PART), part)  # noqa: E731
 
     def mark(marks: tuple[Array, ...], at: Int[Array, ""]) -> tuple[tuple[Array, ...], None]:
         *steps, switches = marks
@@ -172,17 +174,19 @@ def span_places(
         some = ended > begun + 1
         follows = jnp.minimum(begun + 1, parts - 1)
         origin = [jnp.where(some, at_frames(y, follows), at_frames(x, first)) for x, y in zip(t, path, strict=True)]
-        # the frames of the first part, and of the last if it is another
-        within = jnp.arange(PART, dtype=jnp.int32)[:, None, None]
-        frame = PART * jnp.stack([begun, ended])[:, None] + within
-        mine = (frame >= jnp.stack([first, PART * (begun + 1)])[:, None]) & (frame <= last)
-        flat = frame.reshape(-1, objects)
-        near = [at_frames(x, flat).reshape(2 * PART, -1, objects) - o for x, o in zip(t, origin, strict=True)]
-        mine &= at_frames(valid, flat).reshape(frame.shape)
-        near = [jnp.where(mine.reshape(x.shape), x, 0) for x in near]
+        # the frames of the first part, and of the last if it is another; parts are fetched whole, which takes a third as long
+        two = lambda x, y: jnp.concatenate([x, y]).T[..., None]  # noqa: E731  (objects, 2 CHUNK, 1)
+        part = two(begun, ended)
+        frame = PART * part + jnp.arange(PART, dtype=jnp.int32)
+        mine = (frame >= two(first, PART * (begun + 1))) & (frame <= two(last, last)) & whole(valid, part)
+        near = [jnp.where(mine, whole(x, part) - two(o, o), 0) for x, o in zip(t, origin, strict=True)]
+
+        def total(x: Array) -> Array:  # XLA's own sum over so few numbers hands them to another thread
+            each = functools.reduce(jnp.add, (x[..., i] for i in range(PART))).T
+            return each[:CHUNK] + each[CHUNK:]
+
         between = [jnp.where(some, at_frames(x, jnp.maximum(ended - 1, 0)) - at_frames(x, begun), 0) for x in sums]
-        # XLA's own sum over so few rows hands them to another thread
-        *moments, squares = (sum(x[1:], x[0]) + y for x, y in zip((*near, dot(near, near)), between, strict=True))
+        *moments, squares = (total(x) + y for x, y in zip((*near, dot(near, near)), between, strict=True))
         seen_until = counts_at(counts, last.T) - jnp.where(first.T > 0, counts_at(counts, jnp.maximum(first.T - 1, 0)), 0)
         n = jnp.maximum(seen_until.T.astype(number.dtype), 1)
         center = [x / n for x in moments]
