@@ -144,11 +144,7 @@ def prepared(
     t = np.asarray(poses.position, float)
     first = np.argmax(valid, axis=1)
     origin = np.where(valid.any(1)[:, None] & near, t[first, np.arange(poses.objects)], 0.0)
-    rotation, position = np.asarray(poses.rotation), t - origin
-    if not valid.all():
-        seen = valid.T[..., None]
-        rotation, position = np.where(seen, rotation, [1, 0, 0, 0]), np.where(seen, position, 0.0)
-    world = padded_clip(rotation.T, position.T, valid, padded)
+    world = _padded_poses(np.asarray(poses.rotation), t, origin, valid, padded)
     return Prepared(
         world,
         valid,
@@ -169,17 +165,32 @@ def check_rate(rate: float) -> None:
         raise OptionError(f"rate is {rate}: it must be a positive number of frames a second")
 
 
-def padded_clip(rotation: np.ndarray, position: np.ndarray, valid: np.ndarray, padded: Padded = bucket) -> Clip:
-    """Poses (..., objects, frames) in the working precision, padded with unseen identity poses."""
+def _aligned(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """An array that begins where a cache line does: JAX then takes it as it is, not a copy of it."""
+    size = int(np.prod(shape)) * dtype.itemsize
+    raw = np.empty(size + _LINE, np.uint8)
+    return raw[-raw.ctypes.data % _LINE :][:size].view(dtype).reshape(shape)
+
+
+def _padded_poses(
+    rotation: np.ndarray, position: np.ndarray, origin: np.ndarray, valid: np.ndarray, padded: Padded
+) -> Clip:
+    """Poses (frames, objects, components) from each object's `origin` as the engine takes them; what is not `valid`
+    (objects, frames), and the padding, are identity poses."""
     objects, frames = valid.shape
     lanes, length, dtype = 1 << (objects - 1).bit_length(), padded(frames + BLOCK), working_dtype()
-    out: tuple[Any, ...] = tuple(
-        np.zeros((*n, lanes, length), k) for n, k in (((4,), dtype), ((3,), dtype), ((), np.bool_))
-    )
-    for whole, part in zip(out, (rotation, position, valid), strict=True):
-        whole[..., :objects, :frames] = part
-    out[0][0, :, frames:] = out[0][0, objects:] = 1
-    return Clip(*out)
+    q, t, seen = _aligned((4, lanes, length), dtype), _aligned((3, lanes, length), dtype), np.zeros((lanes, length), bool)
+    seen[:objects, :frames] = valid
+    for x, at_rest in ((q, [[[1]], [[0]], [[0]], [[0]]]), (t, 0)):
+        x[:, :, frames:] = x[:, objects:] = at_rest
+    with np.errstate(over="ignore", invalid="ignore"):  # in frames that are masked
+        for begin in range(0, frames, _PIECE):
+            some = slice(begin, min(begin + _PIECE, frames))
+            q[:, :objects, some] = rotation[some].T
+            t[:, :objects, some] = (position[some] - origin).T
+    if not valid.all():
+        q[:, ~seen], t[:, ~seen] = [[1], [0], [0], [0]], 0
+    return Clip(q, t, seen)  # type: ignore[arg-type]
 
 
 def used_joints(motion: Motion, objects: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -192,13 +203,6 @@ def used_joints(motion: Motion, objects: Sequence[int]) -> tuple[tuple[int, ...]
             needed.add(j)
             j = top.parents[j]
     return tuple(sorted(needed)), tuple(k for k, j in enumerate(top.translated) if j in needed)
-
-
-def _aligned(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """An array that begins where a cache line does: JAX then takes it as it is, not a copy of it."""
-    size = int(np.prod(shape)) * dtype.itemsize
-    raw = np.empty(size + _LINE, np.uint8)
-    return raw[-raw.ctypes.data % _LINE :][:size].view(dtype).reshape(shape)
 
 
 def _frames_last(
