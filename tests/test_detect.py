@@ -384,3 +384,17 @@ def test_places_of_spans_by_plain_means():
         np.testing.assert_allclose(place.center[:, k, lane], x.mean(1), atol=2e-6)
         spread = np.sqrt(((x - x.mean(1, keepdims=True)) ** 2).sum(0).mean())
         np.testing.assert_allclose(place.spread[k, lane], spread, atol=5e-6)
+
+
+@pytest.mark.parametrize("order", ["C", "F"])  # as a person has them, and as readers leave them
+def test_rotations_that_are_not_unit_are_normalised(walk, order):
+    rotations = np.asarray(walk.motion.rotations)
+    wanted = detect(walk.motion, FEET)
+    long = dataclasses.replace(walk.motion, rotations=np.asarray(1.5 * rotations, order=order))
+    assert spans(detect(long, FEET)) == spans(wanted)
+    none = np.array(rotations, order=order)
+    none[3:5, 2] = 0
+    clip = prepared(dataclasses.replace(walk.motion, rotations=none), None, None, Settings())
+    assert clip.valid.all() and np.isfinite(clip.arrays.rotations).all()
+    np.testing.assert_array_equal(clip.arrays.rotations[2, :, 3:5], np.eye(4)[:, :1].repeat(2, 1))
+    np.testing.assert_allclose(np.linalg.norm(clip.arrays.rotations, axis=1), 1, atol=1e-6)

@@ -27,6 +27,8 @@ Padded = Callable[[int], int]
 
 _PIECE = 512  # frames
 _LINE = 64  # bytes
+_ROUNDING = 1e-5
+"""How far squares of unit quaternions may be off on average."""
 
 
 @dataclass(frozen=True)
@@ -210,26 +212,30 @@ def _frames_last(
 ) -> tuple[np.ndarray, bool]:
     """Rotations (frames, all, 4) of some joints as (room, 4, length), filled up with the identity; and is every number finite?
 
-    Where their squares can be added up, they are; only where not, each is looked at.
+    How far the sums of all squares are from those of unit quaternions tells whether the numbers have to be looked at one by one.
     """
     frames, count = len(q), len(joints)
     out = _aligned((room, 4, length), dtype)
     out[:, :, frames:] = out[count:] = np.eye(4)[0][:, None]
-    squares = 0.0
+    off = 0.0
     with np.errstate(over="ignore", invalid="ignore"):
         if q.strides[0] == q.itemsize:  # as the readers leave it: each row is copied whole
             for i, j in enumerate(joints):
                 out[i, :, :frames] = q[:, j].T
                 flat = out[i].reshape(-1)
-                squares += float(np.dot(flat, flat))
+                off += abs(float(np.dot(flat, flat)) - length)
         else:
             some = slice(None) if count == q.shape[1] else list(joints)
             for begin in range(0, frames, _PIECE):  # what is turned round stays in the cache
                 piece = q[begin : begin + _PIECE, some].astype(dtype)
                 out[:count, :, begin : begin + len(piece)] = piece.transpose(1, 2, 0)
                 flat = piece.reshape(-1)
-                squares += float(np.dot(flat, flat))
-    return out, bool(np.isfinite(squares)) or bool(np.isfinite(out).all())
+                off += abs(float(np.dot(flat, flat)) - len(piece) * count)
+        if off > _ROUNDING * count * length or not np.isfinite(off):
+            norm = np.sqrt(np.einsum("jkf,jkf->jf", out, out))[:, None]
+            out /= np.where((norm > 0) & (norm < np.inf), norm, 1)
+            out[:, :1][norm == 0] = 1
+    return out, bool(np.isfinite(off)) or bool(np.isfinite(out).all())
 
 
 def _prepared_joints(motion: Motion, objects: Sequence[str] | None, near: bool, padded: Padded) -> Prepared:
