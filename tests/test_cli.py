@@ -352,6 +352,17 @@ def test_export(to: str, annotations: Path, tmp_path: Path, capsys: pytest.Captu
     assert capsys.readouterr().out.strip() == (tmp_path / "out").read_text(encoding="utf-8").strip() != ""
 
 
+def test_exported_events_do_not_write_over_annotations(annotations: Path):
+    from kinjax.formats import read_annotations, write_annotations
+
+    table = write_annotations(annotations.with_suffix(".csv"), read_annotations(annotations))
+    before = table.read_bytes()
+    for source in (annotations, table):
+        assert main(["export", str(source), "--to", "events"]) == 0
+    assert table.read_bytes() == before
+    assert "space begin" in table.with_name(f"{table.stem}-events.csv").read_text(encoding="utf-8")
+
+
 def test_export_needs_to_know_what_for(annotations: Path, capsys: pytest.CaptureFixture[str]):
     assert "--to" in fails(capsys, "export", annotations)
 

@@ -19,7 +19,7 @@ from .options import Export, Info
 from .request import check_file, default_objects, load_clip
 from .show import Screen
 
-EXPORT_SUFFIX = {"vtt": ".vtt", "blender": ".py", "events": ".csv"}
+EXPORT_SUFFIX = {"vtt": ".vtt", "blender": ".py", "events": "-events.csv"}  # annotations may stand beside as .csv
 EXPORT_NAME = {"vtt": "webvtt"}  # where the library calls it by another name
 
 
@@ -79,7 +79,7 @@ def export_command(options: Export) -> int:
     source = check_file(options.annotations, "annotations file")
     found = read_annotations(source)
     name = EXPORT_NAME.get(options.to, options.to)
-    target = options.output or source.with_suffix(EXPORT_SUFFIX[options.to])
+    target = options.output or source.with_name(source.stem + EXPORT_SUFFIX[options.to])
     if target == Path("-"):
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"annotations{EXPORT_SUFFIX[options.to]}"

@@ -1,6 +1,7 @@
 """Detection of kinematic constraints (Le Callennec and Boulic 2006): from poses to constraints.
 
-displacements -> sigma_epsilon -> lmeds, noise -> instantaneous -> merging, settling, refit, windows, pivots -> engine; then
+displacements -> sigma_epsilon -> lmeds, noise, bounds -> instantaneous: steps 1 to 5, which `observing` puts together for a few
+objects at a time; merging, settling, refit, windows, pivots: step 6, which `engine` does for all. Then
 prepare (clips), planning (templates, patterns), batches -> pipeline -> records. `interface` holds what the engine takes and
 gives, `settings` holds every number, `results` what comes back, `prepare` what goes in. Names are imported on first use:
 what only needs the settings loads no engine.
